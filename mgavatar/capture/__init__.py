@@ -1,0 +1,1 @@
+"""Captures: one reader a format behind one ``Subject``; ray-traced synthetic captures."""

@@ -1,0 +1,82 @@
+"""A tracked capture in memory: what every reader returns and what the fit consumes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mgavatar.camera import Camera
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class HeadParams:
+    """FLAME parameters of T timesteps, float32; angles are rotation vectors [rad].
+
+    Attributes:
+        shape: Identity coefficients, shape [S].
+        expr: Expression coefficients, shape [T, E].
+        rotation: Root rotation about the root joint, shape [T, 3].
+        neck_pose: Shape [T, 3].
+        jaw_pose: Shape [T, 3].
+        eyes_pose: Left, then right eye, shape [T, 6].
+        translation: Added after skinning [m], shape [T, 3].
+        static_offset: Vertex offsets of the tracker [m], shape [V, 3], or None.
+    """
+
+    shape: np.ndarray
+    expr: np.ndarray
+    rotation: np.ndarray
+    neck_pose: np.ndarray
+    jaw_pose: np.ndarray
+    eyes_pose: np.ndarray
+    translation: np.ndarray
+    static_offset: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.expr)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a capture.
+
+    Attributes:
+        image_path: The image, composited on ``Subject.background``.
+        mask_path: 8-bit foreground alpha, or None.
+        camera: Calibration at the size of the file.
+        camera_id: Index of the camera in the capture.
+        timestep: Row of ``Subject.params``.
+    """
+
+    image_path: Path
+    mask_path: Path | None
+    camera: Camera
+    camera_id: int
+    timestep: int
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A capture whose files have been checked.
+
+    Attributes:
+        root: The capture's folder.
+        frames: Images of each split; ``val`` or ``test`` may be empty.
+        params: Tracked FLAME parameters of all timesteps of all splits.
+        timestep_ids: The capture's own number of each row of ``params``.
+        background: Colour behind the subject in the images, RGB in 0..1, shape [3], float32.
+        ground_truth: ``ground_truth/*.npz`` beside the images, or None.
+    """
+
+    root: Path
+    frames: dict[Split, tuple[Frame, ...]]
+    params: HeadParams
+    timestep_ids: tuple[int, ...]
+    background: np.ndarray
+    ground_truth: Path | None

@@ -1,0 +1,1 @@
+"""Geometry stage (Section 3.1): vertex-bound Gaussians and the refined mesh."""

@@ -1,0 +1,1 @@
+"""Head models in FLAME's schema: load, build, subdivide, pose."""

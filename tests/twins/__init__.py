@@ -1,0 +1,1 @@
+"""Plain torch float64 twins of the kernels."""
