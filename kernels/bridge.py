@@ -154,3 +154,24 @@ def taped(kernel: wp.Kernel, dim: int, inputs: Sequence[Any], shapes: Sequence[S
         The output tensor, or a tuple of them.
     """
     return _TapeNode.apply(kernel, dim, shapes, *inputs)
+
+
+def sort_pairs(keys: Tensor, values: Tensor, *, bits: int = 32) -> tuple[Tensor, Tensor]:
+    """Stable radix sort of ``keys`` [N] (float32 or int32) carrying ``values`` [N] (int32).
+
+    Args:
+        keys: Sort keys, shape [N].
+        values: Carried along, shape [N], int32.
+        bits: Number of low bits of the keys that can differ.
+
+    Returns:
+        Both in ascending order of the keys, ties in their given order.
+    """
+    n = len(keys)
+    room_keys, room_values = keys.new_empty(2 * n), values.new_empty(2 * n)
+    room_keys[:n], room_values[:n] = keys, values
+    if n:
+        with _torch_stream(keys.device):
+            dtype = wp.float32 if keys.is_floating_point() else wp.int32
+            wp.utils.radix_sort_pairs(to_warp(room_keys, dtype), to_warp(room_values, wp.int32), n, 0, bits)
+    return room_keys[:n], room_values[:n]

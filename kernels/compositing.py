@@ -1,0 +1,187 @@
+"""Alpha compositing, one thread a pixel, with its hand-written adjoint: the readable reference, and the CUDA form.
+
+Front to back, with ``alpha = min(cap, opacity G)`` and ``T`` the light that is left,
+
+    image = sum_k T_k alpha_k c_k + T_end background,    T_{k+1} = T_k (1 - alpha_k).
+
+A Gaussian with ``alpha < threshold`` is skipped; a pixel ends *after* the Gaussian that takes ``T`` below ``stop``. The
+adjoint walks back from the last Gaussian that a pixel accepted, from the *stored* ``T``, which keeps its relative
+precision however small it is. ``behind`` is what a pixel sees past Gaussian k, weighted by the image's gradient; it
+replaces the colour buffers and is a convex combination, so it cannot blow up.
+
+Warp does not replay loops like these, so autodiff is off in this file.
+"""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+TILE = 16
+BLOCK = TILE * TILE
+
+_BLOCK_SUM = """
+#if defined(__CUDA_ARCH__)
+    // Shuffle down each warp, then add the warps in order: no atomics, the same bits every time.
+    __shared__ REAL sums[BLOCK / 32][10];
+    const bool any = __any_sync(0xffffffffu, active);
+    for (int c = 0; c < 10; ++c) {
+        REAL v = active ? values[c] : (REAL)0;
+        if (any)
+            for (int offset = 16; offset > 0; offset >>= 1) v += __shfl_down_sync(0xffffffffu, v, offset);
+        if ((lane & 31) == 0) sums[lane >> 5][c] = v;
+    }
+    __syncthreads();
+    if (lane < 10) {
+        REAL v = (REAL)0;
+        for (int w = 0; w < BLOCK / 32; ++w) v += sums[w][lane];
+        partials.data[row * 10 + lane] = v;
+    }
+    __syncthreads();
+#else
+    // On a CPU the block's threads run one after the other: each adds its share.
+    if (active)
+        for (int c = 0; c < 10; ++c) partials.data[row * 10 + c] += values[c];
+#endif
+"""
+
+
+def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
+    row10 = wp.types.vector(10, real)
+    module = f"{__name__}_{real.__name__}"
+    snippet = _BLOCK_SUM.replace("REAL", {"float32": "float", "float64": "double"}[real.__name__])
+
+    @wp.func_native(snippet.replace("BLOCK", str(BLOCK)))
+    def block_sum(active: bool, values: row10, row: int, lane: int, partials: wp.array2d[real]): ...
+
+    vec2 = wp.types.vector(2, real)
+
+    @wp.func
+    def offset(splats: wp.array2d[real], n: int, x: int, y: int) -> vec2:
+        """u and dy of a pixel's centre (projection.py, row form)."""
+        dy = (real(y) - splats[n, 1]) - splats[n, 3]
+        return vec2((real(x) - splats[n, 0]) - splats[n, 2] - splats[n, 5] * dy, dy)
+
+    @wp.func
+    def gaussian(splats: wp.array2d[real], n: int, d: vec2) -> real:
+        return wp.exp(real(-0.5) * (splats[n, 4] * d[0] * d[0] + splats[n, 6] * d[1] * d[1]))
+
+    @wp.kernel(module=module, enable_backward=False)
+    def composite_kernel(
+        # In:
+        splats: wp.array2d[real],  # [N, 12] projection.SPLAT
+        tile_begin: wp.array[wp.int32],  # [T]
+        tile_end: wp.array[wp.int32],  # [T]
+        items: wp.array[wp.int32],  # [M]
+        item_splat: wp.array[wp.int32],  # [M]
+        background: wp.array[real],  # [3]
+        n_columns: int,
+        alpha_threshold: real,
+        stop: real,
+        cap: real,
+        # Out:
+        image: wp.array3d[real],  # [5, H, W] red, green, blue, alpha, depth
+        final_T: wp.array2d[real],  # [H, W]
+        last: wp.array2d[wp.int32],  # [H, W] entry of items last accepted, -1 if none
+    ):
+        thread = wp.tid()
+        tile = thread // BLOCK
+        lane = thread % BLOCK
+        x = (tile % n_columns) * TILE + lane % TILE
+        y = (tile // n_columns) * TILE + lane // TILE
+        if x >= image.shape[2] or y >= image.shape[1]:
+            return
+        T = real(1.0)
+        red, green, blue, depth = real(0.0), real(0.0), real(0.0), real(0.0)
+        accepted = int(-1)
+        for k in range(tile_begin[tile], tile_end[tile]):
+            if T >= stop:
+                n = item_splat[items[k]]
+                alpha = wp.min(cap, splats[n, 7] * gaussian(splats, n, offset(splats, n, x, y)))
+                if alpha >= alpha_threshold:
+                    weight = alpha * T
+                    red += weight * splats[n, 8]
+                    green += weight * splats[n, 9]
+                    blue += weight * splats[n, 10]
+                    depth += weight * splats[n, 11]
+                    T = T * (real(1.0) - alpha)  # T - weight would lose it to rounding when alpha is near 1
+                    accepted = k
+        image[0, y, x] = red + T * background[0]
+        image[1, y, x] = green + T * background[1]
+        image[2, y, x] = blue + T * background[2]
+        image[3, y, x] = real(1.0) - T
+        image[4, y, x] = depth
+        final_T[y, x] = T
+        last[y, x] = accepted
+
+    @wp.kernel(module=module, enable_backward=False)
+    def composite_bwd_kernel(
+        # In:
+        splats: wp.array2d[real],  # [N, 12]
+        tile_begin: wp.array[wp.int32],  # [T]
+        tile_end: wp.array[wp.int32],  # [T]
+        items: wp.array[wp.int32],  # [M]
+        item_splat: wp.array[wp.int32],  # [M]
+        background: wp.array[real],  # [3]
+        n_columns: int,
+        alpha_threshold: real,
+        cap: real,
+        final_T: wp.array2d[real],  # [H, W]
+        last: wp.array2d[wp.int32],  # [H, W]
+        v_image: wp.array3d[real],  # [5, H, W]
+        # Out:
+        partials: wp.array2d[real],  # [M, 10] zero at first
+    ):
+        thread = wp.tid()
+        tile = thread // BLOCK
+        lane = thread % BLOCK
+        x = (tile % n_columns) * TILE + lane % TILE
+        y = (tile // n_columns) * TILE + lane // TILE
+        T = real(1.0)
+        v_red, v_green, v_blue, v_depth, behind = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
+        accepted = int(-1)
+        if x < v_image.shape[2] and y < v_image.shape[1]:
+            T = final_T[y, x]
+            v_red = v_image[0, y, x]
+            v_green = v_image[1, y, x]
+            v_blue = v_image[2, y, x]
+            v_depth = v_image[4, y, x]
+            behind = v_red * background[0] + v_green * background[1] + v_blue * background[2] - v_image[3, y, x]
+            accepted = last[y, x]
+        # Every thread of the block walks the same entries: the block sums need all of them.
+        for step in range(tile_end[tile] - tile_begin[tile]):
+            k = tile_end[tile] - 1 - step
+            n = item_splat[items[k]]
+            active = bool(False)
+            grad = row10()
+            if k <= accepted:
+                d = offset(splats, n, x, y)
+                G = gaussian(splats, n, d)
+                alpha = wp.min(cap, splats[n, 7] * G)
+                if alpha >= alpha_threshold:
+                    active = True
+                    T = wp.min(T / (real(1.0) - alpha), real(1.0))
+                    weight = alpha * T
+                    seen = v_red * splats[n, 8] + v_green * splats[n, 9] + v_blue * splats[n, 10] + v_depth * splats[n, 11]
+                    v_alpha = T * (seen - behind)
+                    behind = alpha * seen + (real(1.0) - alpha) * behind
+                    grad[6] = weight * v_red
+                    grad[7] = weight * v_green
+                    grad[8] = weight * v_blue
+                    grad[9] = weight * v_depth
+                    if splats[n, 7] * G <= cap:
+                        v_log = splats[n, 7] * G * v_alpha
+                        au = splats[n, 4] * d[0]
+                        grad[0] = v_log * au
+                        grad[1] = v_log * (splats[n, 6] * d[1] - au * splats[n, 5])
+                        grad[2] = real(-0.5) * v_log * d[0] * d[0]
+                        grad[3] = v_log * au * d[1]
+                        grad[4] = real(-0.5) * v_log * d[1] * d[1]
+                        grad[5] = G * v_alpha
+            block_sum(active, grad, items[k], lane, partials)
+
+    return composite_kernel, composite_bwd_kernel
+
+
+KERNELS = {torch.float32: _kernels(wp.float32), torch.float64: _kernels(wp.float64)}
+"""(composite, its adjoint) by dtype."""

@@ -1,0 +1,210 @@
+"""The rasterizer: 3D Gaussians and a camera to an image, differentiable in all of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mgavatar.kernels import bridge, compositing, compositing_rows, projection
+from mgavatar.kernels.tiling import WorkLists, build_work_lists
+
+Form = Literal["auto", "plain", "rows"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterSettings:
+    """What the rasterizer leaves out, and where; ``docs/numerics.md`` has the price of each."""
+
+    alpha_threshold: float = 1.0 / 255.0
+    """Contributions below this alpha are skipped; 0 blends every Gaussian with every pixel."""
+    stop: float = 1e-4
+    """A pixel ends after the Gaussian that takes its transmittance below this; 0 never ends it."""
+    alpha_cap: float = 0.9999
+    """Largest alpha of one Gaussian at one pixel."""
+    low_pass: float = 0.3
+    """Variance added to both image axes [px^2]."""
+    near: float = 0.01
+    """Gaussians nearer than this are not drawn [m]."""
+    form: Form = "auto"
+    """``plain`` is one thread a pixel, on any device and dtype; ``rows`` is the CPU's vector form in float32."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What one camera sees.
+
+    Attributes:
+        image: Composited colours, shape [3, H, W].
+        alpha: Coverage, shape [H, W].
+        depth: Sum of blending weight times depth [m], not divided by alpha, shape [H, W].
+        visible: Which Gaussians touch the image, shape [N], bool.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor
+    visible: Tensor
+
+
+_NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
+
+
+def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, settings: RasterSettings) -> None:
+    shapes: tuple[tuple[int, ...], ...] = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (4, 4), (3, 3), (3,))
+    for name, tensor, shape in zip(_NAMES, tensors, shapes, strict=True):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}, needs {shape}")
+        if tensor.dtype != tensors[0].dtype or tensor.device != tensors[0].device:
+            raise ValueError(
+                f"{name} is {tensor.dtype} on {tensor.device}, means is {tensors[0].dtype} on {tensors[0].device}"
+            )
+    if tensors[0].dtype not in projection.KERNELS:
+        raise ValueError(f"means is {tensors[0].dtype}, needs float32 or float64")
+    if width < 1 or height < 1:
+        raise ValueError(f"image size must be positive, got {width} x {height}")
+    if not 0.0 < settings.alpha_cap < 1.0:
+        raise ValueError(f"alpha_cap must lie between 0 and 1, got {settings.alpha_cap}")
+    if settings.near <= 0.0:
+        raise ValueError(f"near must be positive, got {settings.near}")
+
+
+def _form(settings: RasterSettings, means: Tensor) -> Form:
+    rows_fit = means.device.type == "cpu" and means.dtype == torch.float32
+    if settings.form == "rows" and not rows_fit:
+        raise ValueError(f"form 'rows' needs float32 on a CPU, means is {means.dtype} on {means.device}")
+    if settings.form == "auto":
+        return "rows" if rows_fit else "plain"
+    return settings.form
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, settings: RasterSettings, size: tuple[int, int], screen_grads: Tensor | None, *tensors: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        tensors = tuple(tensor.contiguous() for tensor in tensors)
+        means, quats, scales, opacities, colors, viewmat, K, background = tensors
+        width, height = size
+        n = len(means)
+        form = _form(settings, means)
+        tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
+        n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
+        splats = means.new_empty(n, 12)
+        tiles = torch.empty(n, 4, dtype=torch.int32, device=means.device)
+        keys = torch.empty(n, dtype=torch.float32, device=means.device)
+        camera = (viewmat[None], K[None], width, height)
+        limits = (settings.near, settings.low_pass, settings.alpha_threshold)
+        if n:
+            gaussians = (means, quats, scales, opacities, colors)
+            bridge.launch_ranges(
+                projection.KERNELS[means.dtype][0], n, [*gaussians, *camera, *tile, *limits], [splats, tiles, keys]
+            )
+        lists = build_work_lists(keys, tiles, n_columns, n_rows)
+        image = means.new_empty(5, height, width)
+        final_T = means.new_empty(height, width)
+        last = torch.empty(height, width, dtype=torch.int32, device=means.device)
+        inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
+        knobs = [settings.alpha_threshold, settings.stop, settings.alpha_cap]
+        n_tiles = n_columns * n_rows
+        if form == "rows":
+            bridge.launch_ranges(
+                compositing_rows.composite_rows_kernel, n_tiles, [*inputs, *knobs], [image, final_T, last]
+            )
+        else:
+            kernel = compositing.KERNELS[means.dtype][0]
+            bridge.launch(kernel, n_tiles * compositing.BLOCK, [*inputs, *knobs], [image, final_T, last])
+        ctx.save_for_backward(*tensors, splats, final_T, last)
+        ctx.lists, ctx.settings, ctx.size, ctx.form, ctx.screen_grads = lists, settings, size, form, screen_grads
+        visible = lists.n_items > 0
+        ctx.mark_non_differentiable(visible)
+        return image, visible
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_image: Tensor, _: Tensor) -> Any:
+        *tensors, splats, final_T, last = ctx.saved_tensors
+        means, quats, scales, opacities, colors, viewmat, K, background = tensors
+        width, height = ctx.size
+        lists: WorkLists = ctx.lists
+        settings: RasterSettings = ctx.settings
+        v_image = v_image.contiguous()
+        partials = means.new_zeros(len(lists.items), 10)
+        n_tiles = len(lists.tile_begin)
+        rows = ctx.form == "rows"
+        n_columns = -(-width // (compositing_rows.TILE_WIDTH if rows else compositing.TILE))
+        inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
+        inputs += [settings.alpha_threshold, settings.alpha_cap, final_T, last, v_image]
+        if rows:
+            bridge.launch_ranges(compositing_rows.composite_rows_bwd_kernel, n_tiles, inputs, [partials])
+        else:
+            kernel = compositing.KERNELS[means.dtype][1]
+            bridge.launch(kernel, n_tiles * compositing.BLOCK, inputs, [partials])
+        grads = [torch.zeros_like(tensor) for tensor in tensors[:5]]
+        means2d = ctx.screen_grads if ctx.screen_grads is not None else means.new_empty(len(means), 2)
+        means2d.zero_()
+        wants_camera = ctx.needs_input_grad[8]
+        v_views = means.new_zeros(len(means) if wants_camera else 0, 12)
+        if len(means):
+            camera = [viewmat[None], K[None], width, height, settings.low_pass]
+            bridge.launch_ranges(
+                projection.KERNELS[means.dtype][1],
+                len(means),
+                [means, quats, scales, *camera, lists.first_item, lists.n_items, partials],
+                [*grads, means2d, v_views],
+            )
+        v_viewmat = None
+        if wants_camera:
+            v_viewmat = torch.zeros_like(viewmat)
+            v_viewmat[:3] = v_views.sum(0).reshape(3, 4)
+        v_background = (v_image[:3] * final_T).sum((1, 2)) if ctx.needs_input_grad[10] else None
+        return None, None, None, *grads, v_viewmat, None, v_background
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    *,
+    viewmat: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    background: Tensor | None = None,
+    settings: RasterSettings | None = None,
+    screen_grads: Tensor | None = None,
+) -> Rendering:
+    """Draw Gaussians as a camera sees them (EWA splatting, front to back).
+
+    Differentiable in the Gaussians, ``viewmat`` and ``background``; deterministic on every device and for any number
+    of threads. A Gaussian with a NaN, an infinity or a zero quaternion is not drawn and gets a zero gradient.
+
+    Args:
+        means: Centres in world space [m], shape [N, 3], float32 or float64.
+        quats: Rotations wxyz, normalised here; norms outside 1e-12..1e12 are not drawn, shape [N, 4].
+        scales: Standard deviations along the rotated axes [m], shape [N, 3].
+        opacities: In 0..1, shape [N].
+        colors: RGB, shape [N, 3].
+        viewmat: World to camera, OpenCV axes, shape [4, 4].
+        K: Intrinsics [px], shape [3, 3].
+        size: Image width and height [px].
+        background: RGB behind everything, black by default, shape [3].
+        settings: Truncations and form.
+        screen_grads: Filled by the backward pass with the gradient of the image-space means [1/px], shape [N, 2].
+
+    Returns:
+        Image, coverage, depth and visibility.
+
+    Raises:
+        ValueError: If shapes, dtypes, devices or settings do not fit, or the work exceeds 2^31 - 1 items.
+    """
+    settings = settings or RasterSettings()
+    background = means.new_zeros(3) if background is None else background
+    tensors = (means, quats, scales, opacities, colors, viewmat, K, background)
+    _check(len(means), tensors, *size, settings)
+    image, visible = _Rasterize.apply(settings, size, screen_grads, *tensors)
+    return Rendering(image[:3], image[3], image[4], visible)

@@ -1,0 +1,113 @@
+"""Depth order and work lists: which splats each tile of the image blends, front to back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from mgavatar.kernels import bridge
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_ITEMS = 2**31 - 1
+"""Warp's arrays end here."""
+
+
+@wp.kernel
+def _emit_kernel(
+    # In:
+    order: wp.array[wp.int32],  # [N] Gaussians by depth
+    offsets: wp.array[wp.int32],  # [N] first item of each Gaussian, in depth order
+    tiles: wp.array2d[wp.int32],  # [N, 4]
+    n_columns: int,
+    # Out:
+    item_tile: wp.array[wp.int32],  # [M]
+    item_splat: wp.array[wp.int32],  # [M]
+    first_item: wp.array[wp.int32],  # [N]
+):
+    i = wp.tid()
+    n = order[i]
+    item = offsets[i]
+    first_item[n] = item
+    for row in range(tiles[n, 2], tiles[n, 3]):
+        for column in range(tiles[n, 0], tiles[n, 1]):
+            item_tile[item] = row * n_columns + column
+            item_splat[item] = n
+            item += 1
+
+
+@wp.kernel
+def _tile_bounds_kernel(
+    # In:
+    sorted_tiles: wp.array[wp.int32],  # [M]
+    # Out:
+    tile_begin: wp.array[wp.int32],  # [T] zero where the tile is empty
+    tile_end: wp.array[wp.int32],  # [T]
+):
+    m = wp.tid()
+    tile = sorted_tiles[m]
+    if m == 0 or sorted_tiles[m - 1] != tile:
+        tile_begin[tile] = m
+    if m + 1 == sorted_tiles.shape[0] or sorted_tiles[m + 1] != tile:
+        tile_end[tile] = m + 1
+
+
+@dataclass(frozen=True)
+class WorkLists:
+    """For each tile, its splats from near to far; each (tile, splat) pair is an *item*.
+
+    Attributes:
+        tile_begin: First entry of ``items`` of each tile, shape [T], int32.
+        tile_end: One past the last, shape [T], int32.
+        items: Items grouped by tile, front to back, shape [M], int32.
+        item_splat: Splat of each item, shape [M], int32.
+        first_item: First item of each splat; its items are consecutive, shape [N], int32.
+        n_items: Items of each splat, shape [N], int32.
+    """
+
+    tile_begin: Tensor
+    tile_end: Tensor
+    items: Tensor
+    item_splat: Tensor
+    first_item: Tensor
+    n_items: Tensor
+
+
+def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -> WorkLists:
+    """Sort splats by depth once, ties by index, and hand them to the tiles that they touch.
+
+    Args:
+        keys: Depth of each splat, shape [N], float32.
+        tiles: First and last + 1 tile column, then row, of each splat, shape [N, 4], int32.
+        n_columns: Tiles across the image.
+        n_rows: Tiles down the image.
+
+    Raises:
+        ValueError: If there would be more than 2^31 - 1 items.
+    """
+    n = len(keys)
+    device = keys.device
+    n_items = (tiles[:, 1] - tiles[:, 0]).long() * (tiles[:, 3] - tiles[:, 2]).long()
+    order = bridge.sort_pairs(keys, torch.arange(n, dtype=torch.int32, device=device))[1]
+    ends = torch.cumsum(n_items[order.long()], 0)
+    total = int(ends[-1]) if n else 0
+    if total > MAX_ITEMS:
+        raise ValueError(
+            f"{total} pairs of tile and Gaussian are more than {MAX_ITEMS}: lower the image size, the number of "
+            "Gaussians or their scales"
+        )
+    offsets = (ends - n_items[order.long()]).int()
+    counts = n_items.int()
+    first_item = torch.zeros(n, dtype=torch.int32, device=device)
+    item_tile, item_splat = torch.empty(2, total, dtype=torch.int32, device=device)
+    bounds = torch.zeros(2, n_columns * n_rows, dtype=torch.int32, device=device)
+    items = torch.arange(total, dtype=torch.int32, device=device)
+    if total:
+        bridge.launch(_emit_kernel, n, [order, offsets, tiles, n_columns], [item_tile, item_splat, first_item])
+        bits = max(1, (n_columns * n_rows - 1).bit_length())
+        item_tile, items = bridge.sort_pairs(item_tile, items, bits=bits)
+        bridge.launch(_tile_bounds_kernel, total, [item_tile], [bounds[0], bounds[1]])
+    return WorkLists(bounds[0], bounds[1], items, item_splat, first_item, counts)
