@@ -15,8 +15,6 @@ from torch.autograd.function import once_differentiable
 from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype, pick
 
-wp.set_module_options({"enable_backward": False})
-
 _BLOCK = 2048  # numbers that one CPU item adds up, so that they stay in the first-level cache
 _LANES = 64  # partial sums of a dot product, the same on a CPU (vector lanes) and on CUDA (threads)
 _CHUNK = 128  # vertices whose share of a transform's gradient one item adds up
@@ -107,7 +105,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         partial: wp.array2d(dtype=scalar),
     ): ...
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def blend_kernel(
         first: int,
         # In:
@@ -120,7 +118,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
     ):
         add_directions(first + wp.tid(), width, dirs, coeffs, start, out)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def blend_bwd_kernel(
         first: int,
         # In:
@@ -133,7 +131,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         begin = (first + wp.tid()) * width
         dot_direction(begin // wp.static(_LANES), begin % wp.static(_LANES), width, dirs, grad, partial)
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def sum_kernel(
         # In:
         partial: wp.array2d(dtype=scalar),  # [M, N]
@@ -162,7 +160,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
             total += weights[v, j] * transforms[j]
         return total
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def skin_kernel(
         first: int,
         # In:
@@ -177,7 +175,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         q = blended(v, weights, transforms) @ vec4(p[0], p[1], p[2], scalar(1.0))
         out[v] = vec3(q[0], q[1], q[2])
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def skin_verts_bwd_kernel(
         first: int,
         # In:
@@ -192,7 +190,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         q = wp.transpose(blended(v, weights, transforms)) @ vec4(g[0], g[1], g[2], scalar(0.0))
         grad_verts[v] = vec3(q[0], q[1], q[2])
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def skin_transforms_bwd_kernel(
         first: int,
         # In:
@@ -211,7 +209,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
             total += wp.outer(weights[v, j] * grad[v], vec4(p[0], p[1], p[2], scalar(1.0)))
         partial[j, chunk] = total
 
-    @wp.kernel(module=module)
+    @wp.kernel(module=module, enable_backward=False)
     def sum_transforms_kernel(
         # In:
         partial: wp.array2d(dtype=mat34),  # [J, chunks]
@@ -410,7 +408,7 @@ def _rotation_bwd(w: wp.vec3d, grad: wp.mat33d):
     return a * spin + b * outer + (da * grad_a + db * grad_b) * w
 
 
-@wp.kernel(module=f"{__name__}.joints")
+@wp.kernel(module=f"{__name__}.joints", enable_backward=False)
 def _joints_kernel(
     # In:
     joints: wp.array(dtype=wp.vec3d),  # [J]
@@ -443,7 +441,7 @@ def _joints_kernel(
         )
 
 
-@wp.kernel(module=f"{__name__}.joints")
+@wp.kernel(module=f"{__name__}.joints", enable_backward=False)
 def _joints_bwd_kernel(
     # In:
     joints: wp.array(dtype=wp.vec3d),  # [J]

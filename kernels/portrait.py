@@ -65,16 +65,59 @@ def step_between(low: float, high: float, x: float):
 
 
 @wp.func
+def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32):
+    """A random number of a lattice point, -1..1."""
+    h = x * wp.uint32(73856093) ^ y * wp.uint32(19349663) ^ z * wp.uint32(83492791) ^ seed * wp.uint32(2654435769)
+    h = (h ^ (h >> wp.uint32(15))) * wp.uint32(2246822519)
+    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(3266489917)
+    return float((h ^ (h >> wp.uint32(16))) >> wp.uint32(8)) * (2.0 / 16777216.0) - 1.0
+
+
+@wp.func
+def noise(seed: wp.uint32, point: wp.vec3):
+    """Value noise, -1..1: random numbers on the integer lattice, joined smoothly; several times faster than Perlin's."""
+    low = wp.vec3(wp.floor(point[0]), wp.floor(point[1]), wp.floor(point[2]))
+    t = point - low
+    f = wp.cw_mul(wp.cw_mul(t, t), wp.vec3(3.0, 3.0, 3.0) - 2.0 * t)
+    x, y, z = wp.uint32(wp.int32(low[0])), wp.uint32(wp.int32(low[1])), wp.uint32(wp.int32(low[2]))
+    one = wp.uint32(1)
+    near = wp.lerp(
+        wp.lerp(lattice(x, y, z, seed), lattice(x + one, y, z, seed), f[0]),
+        wp.lerp(lattice(x, y + one, z, seed), lattice(x + one, y + one, z, seed), f[0]),
+        f[1],
+    )
+    far = wp.lerp(
+        wp.lerp(lattice(x, y, z + one, seed), lattice(x + one, y, z + one, seed), f[0]),
+        wp.lerp(lattice(x, y + one, z + one, seed), lattice(x + one, y + one, z + one, seed), f[0]),
+        f[1],
+    )
+    return wp.lerp(near, far, f[2])
+
+
+@wp.func
+def noise2(seed: wp.uint32, x: float, y: float):
+    """Value noise in the plane, -1..1."""
+    i, j = wp.floor(x), wp.floor(y)
+    s, t = x - i, y - j
+    s, t = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
+    u, v = wp.uint32(wp.int32(i)), wp.uint32(wp.int32(j))
+    one, none = wp.uint32(1), wp.uint32(0)
+    low = wp.lerp(lattice(u, v, none, seed), lattice(u + one, v, none, seed), s)
+    return wp.lerp(low, wp.lerp(lattice(u, v + one, none, seed), lattice(u + one, v + one, none, seed), s), t)
+
+
+@wp.func
 def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32):
     """Round spots, at most one in each cell of a grid [m]: 1 inside, 0 outside."""
     grid = point / cell
     corner = wp.vec3(wp.floor(grid[0]), wp.floor(grid[1]), wp.floor(grid[2]))
-    index = wp.int32(corner[0]) * 73856093 ^ wp.int32(corner[1]) * 19349663 ^ wp.int32(corner[2]) * 83492791
-    state = wp.rand_init(wp.int32(seed), index)
-    center = corner + wp.vec3(0.3, 0.3, 0.3) + 0.4 * wp.vec3(wp.randf(state), wp.randf(state), wp.randf(state))
-    radius = 0.12 + 0.16 * wp.randf(state)
-    inside = 1.0 - step_between(0.6 * radius, radius, wp.length(grid - center))
-    return wp.where(wp.randf(state) < chance, inside, 0.0)
+    x, y, z = wp.uint32(wp.int32(corner[0])), wp.uint32(wp.int32(corner[1])), wp.uint32(wp.int32(corner[2]))
+    if 0.5 + 0.5 * lattice(x, y, z, seed) > chance:
+        return 0.0
+    shift = wp.vec3(lattice(y, z, x, seed), lattice(z, x, y, seed), lattice(z, y, x, seed))
+    radius = 0.20 + 0.08 * lattice(y, x, z, seed)
+    distance = wp.length(grid - corner - wp.vec3(0.5, 0.5, 0.5) - 0.2 * shift)
+    return 1.0 - step_between(0.6 * radius, radius, distance)
 
 
 @wp.func
@@ -84,10 +127,10 @@ def strands(point: wp.vec3, seed: wp.uint32):
     around = wp.atan2(arm[0], arm[2])
     above = wp.atan2(arm[1] - 0.02, wp.length(wp.vec2(arm[0], arm[2])))
     ring = wp.cos(above)
-    waves = 0.10 * wp.sin(9.0 * above + 3.0 * wp.noise(seed, wp.vec2(2.0 * around, 2.0 * above)))
+    waves = 0.10 * wp.sin(9.0 * above + 3.0 * noise2(seed, 2.0 * around, 2.0 * above))
     thread = wp.vec3(ring * wp.sin(around + waves), ring * wp.cos(around + waves), 0.06 * above)
-    fine = wp.noise(seed, 42.0 * thread + wp.vec3(0.0, 0.0, 3.1))
-    coarse = wp.noise(seed, 13.0 * thread)
+    fine = noise(seed, 42.0 * thread + wp.vec3(0.0, 0.0, 3.1))
+    coarse = noise(seed, 13.0 * thread)
     return wp.clamp(0.9 * fine + 1.1 * coarse, -1.0, 1.0)
 
 
@@ -100,32 +143,37 @@ def brow(point: wp.vec3, look: Look):
     half = 0.0042 * (1.0 - 0.55 * wp.clamp(along, 0.0, 1.0))
     ends = step_between(-0.12, 0.08, along) * (1.0 - step_between(0.8, 1.12, along))
     body = ends * (1.0 - step_between(0.5, 1.15, wp.abs(point[1] - arc) / half))
-    strokes = wp.noise(look.seed, wp.vec2(900.0 * (x - 0.45 * point[1]), 160.0 * point[1]))
-    return wp.where(point[2] > -0.03, wp.clamp(body * (0.82 + 0.5 * strokes), 0.0, 1.0), 0.0)
+    strokes = noise2(look.seed, 900.0 * (x - 0.45 * point[1]), 160.0 * point[1])
+    return wp.clamp(body * (0.82 + 0.5 * strokes), 0.0, 1.0)
 
 
 @wp.func
 def skin_color(point: wp.vec3, lips: float, look: Look):
     """Skin with mottling, flushed cheeks, freckles, stubble, brows and lips."""
-    mottle = wp.noise(look.seed, 55.0 * point) + 0.6 * wp.noise(look.seed, 190.0 * point)
-    pores = wp.noise(look.seed, 620.0 * point)
+    mottle = noise(look.seed, 55.0 * point) + 0.6 * noise(look.seed, 190.0 * point)
+    pores = noise(look.seed, 620.0 * point)
     color = look.skin * (1.0 + 0.10 * mottle + 0.07 * pores)
     flush = 0.75 * blob(point, wp.vec3(0.040, -0.028, 0.018), 0.016) + 0.7 * blob(point, wp.vec3(0.0, -0.030, 0.05), 0.012)
     flush += 0.5 * blob(point, wp.vec3(0.078, -0.01, -0.07), 0.022)
     color = wp.cw_mul(color, wp.vec3(1.0, 1.0 - 0.30 * flush, 1.0 - 0.26 * flush))
-    sunny = 0.12 + blob(point, wp.vec3(0.026, -0.018, 0.03), 0.022)
+    sunny = 0.10 + blob(point, wp.vec3(0.026, -0.018, 0.03), 0.022)
     freckle = spots(point, 0.0052, look.freckles * sunny, look.seed)
     mole = spots(point, 0.021, 0.10, look.seed + wp.uint32(5))
     color = wp.cw_mul(color, wp.vec3(1.0, 1.0, 1.0) - wp.vec3(0.32, 0.45, 0.52) * wp.max(freckle, 1.3 * mole))
     jaw = step_between(-0.040, -0.062, point[1]) * step_between(-0.062, -0.03, point[2])
     jaw *= step_between(-0.135, -0.105, point[1]) + blob(point, wp.vec3(0.0, -0.042, 0.04), 0.012)
-    bristle = wp.clamp(0.65 + 0.6 * wp.noise(look.seed, 480.0 * point), 0.0, 1.0)
-    color = wp.lerp(color, 0.45 * look.hair_dark + 0.22 * color, look.stubble * wp.clamp(jaw, 0.0, 1.0) * bristle)
+    beard = look.stubble * wp.clamp(jaw, 0.0, 1.0)
+    if beard > 0.0:
+        bristle = wp.clamp(0.65 + 0.6 * noise(look.seed, 480.0 * point), 0.0, 1.0)
+        color = wp.lerp(color, 0.45 * look.hair_dark + 0.22 * color, beard * bristle)
     socket = blob(point, wp.vec3(0.031, -0.002, 0.018), 0.013)
     color = wp.cw_mul(color, wp.vec3(1.0 - 0.16 * socket, 1.0 - 0.26 * socket, 1.0 - 0.22 * socket))
-    lip = look.lips * (1.0 + 0.16 * wp.noise(look.seed, wp.vec2(700.0 * point[0], 60.0 * point[1])))
-    color = wp.lerp(color, lip, 0.85 * lips * (1.0 - 0.5 * look.stubble))
-    return wp.lerp(color, 0.75 * look.hair_dark, 0.88 * brow(point, look))
+    if lips > 0.0:
+        lip = look.lips * (1.0 + 0.16 * noise2(look.seed, 700.0 * point[0], 60.0 * point[1]))
+        color = wp.lerp(color, lip, 0.85 * lips * (1.0 - 0.5 * look.stubble))
+    if wp.abs(point[1] - 0.022) < 0.02 and point[2] > -0.03:
+        color = wp.lerp(color, 0.75 * look.hair_dark, 0.88 * brow(point, look))
+    return color
 
 
 @wp.func
@@ -135,9 +183,9 @@ def eye_color(point: wp.vec3, look: Look):
     out = wp.normalize(point - center)
     radius = wp.acos(wp.clamp(out[2], -1.0, 1.0)) * look.eye_radius
     around = wp.atan2(out[1], out[0])
-    fibres = wp.noise(look.seed, wp.vec2(11.0 * around, 900.0 * radius))
+    fibres = noise2(look.seed, 11.0 * around, 900.0 * radius)
     iris = look.iris * (1.0 + 0.55 * fibres) * (1.15 - 0.5 * step_between(0.0040, 0.0058, radius))
-    white = wp.vec3(0.74, 0.70, 0.67) * (1.0 - 0.06 * wp.noise(look.seed, 400.0 * point))
+    white = wp.vec3(0.74, 0.70, 0.67) * (1.0 - 0.06 * noise(look.seed, 400.0 * point))
     veins = step_between(0.008, 0.013, radius)
     white = wp.cw_mul(white, wp.vec3(1.0, 1.0 - 0.30 * veins, 1.0 - 0.30 * veins))
     color = wp.lerp(iris, white, step_between(0.0056, 0.0063, radius))
@@ -148,18 +196,18 @@ def eye_color(point: wp.vec3, look: Look):
 def cloth_color(point: wp.vec3, collar: float, look: Look):
     """A knitted weave with one of four patterns and a ribbed collar."""
     around = wp.atan2(point[0], point[2] + 0.08)
+    across = 0.7 * around * (0.09 + 0.6 * wp.length(wp.vec2(point[0], point[2] + 0.08)))
     ink = 0.0
     if look.pattern == 1:
-        ink = step_between(-0.25, 0.25, wp.sin(210.0 * point[1] + 3.0 * wp.noise(look.seed, 9.0 * point)))
+        ink = step_between(-0.25, 0.25, wp.sin(210.0 * point[1] + 3.0 * noise(look.seed, 9.0 * point)))
     elif look.pattern == 2:
-        ink = 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * point[0])) + 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * point[1]))
+        ink = 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * across)) + 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * point[1]))
     elif look.pattern == 3:
-        cell = wp.vec2(wp.sin(190.0 * point[0]), wp.sin(190.0 * point[1]))
-        ink = step_between(0.55, 0.75, cell[0] * cell[1])
+        ink = step_between(0.55, 0.75, wp.sin(190.0 * across) * wp.sin(190.0 * point[1]))
     weave = wp.sin(2100.0 * point[1]) * wp.sin(1500.0 * point[0] + 1500.0 * point[2])
     ribs = wp.sin(95.0 * around)
     color = wp.lerp(look.cloth, look.print, ink * (1.0 - collar))
-    color = color * (1.0 + 0.05 * weave + 0.16 * wp.noise(look.seed, 70.0 * point))
+    color = color * (1.0 + 0.05 * weave + 0.16 * noise(look.seed, 70.0 * point))
     return color * (1.0 - collar * (0.18 - 0.14 * ribs))
 
 
@@ -186,7 +234,8 @@ def light_color(i: int):
 def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: float):
     """Normalized Blinn-Phong with Schlick's Fresnel term."""
     half = wp.normalize(view + light)
-    fresnel = base + (1.0 - base) * wp.pow(1.0 - wp.max(wp.dot(view, half), 0.0), 5.0)
+    grazing = 1.0 - wp.max(wp.dot(view, half), 0.0)
+    fresnel = base + (1.0 - base) * grazing * grazing * grazing * grazing * grazing
     return fresnel * (power + 8.0) / 25.13 * wp.pow(wp.max(wp.dot(normal, half), 0.0), power)
 
 
@@ -203,7 +252,7 @@ def encode(color: wp.vec3):
     """Linear to display values: a soft shoulder, then sRGB's power law (without its linear toe)."""
     out = wp.vec3()
     for i in range(3):
-        out[i] = wp.pow(wp.clamp(1.0 - wp.exp(-1.25 * wp.max(color[i], 0.0)), 0.0, 1.0), 0.4545)
+        out[i] = wp.pow(1.0 - wp.exp(-1.25 * wp.max(color[i], 0.0)), 0.4545)
     return out
 
 
@@ -241,25 +290,31 @@ def shade(
         color = eye_color(rest, look)
         power, base, rough, wrap = 350.0, 0.06, 0.0, 0.15
     elif kind == TEETH:
-        color = wp.vec3(0.72, 0.67, 0.57)
+        color = wp.vec3(0.95, 0.86, 0.70)
         power, rough = 60.0, 0.03
     elif kind == CLOTH:
         color = cloth_color(rest, marks[3], look)
         power, base, rough, wrap = 6.0, 0.01, 0.22, 0.1
-    bump = wp.vec3(wp.noise(look.seed, 330.0 * rest), wp.noise(look.seed, 290.0 * rest + wp.vec3(9.5, 4.5, 7.5)), 0.0)
+    bump = wp.vec3(noise(look.seed, 330.0 * rest), noise(look.seed, 290.0 * rest + wp.vec3(9.5, 4.5, 7.5)), 0.0)
     normal = wp.normalize(normal_in + rough * bump)
     if wp.dot(normal, view) < 0.0:
         normal = wp.normalize(normal - 1.05 * wp.dot(normal, view) * view)
     sky = 0.5 + 0.5 * normal[1]
     total = wp.cw_mul(color, wp.lerp(wp.vec3(0.20, 0.18, 0.17), wp.vec3(0.46, 0.48, 0.53), sky)) * marks[2]
-    shadow = lit(mesh, point, normal_in, light_direction(0))
+    shadow = wp.float32(1.0)
+    if wp.dot(normal_in, light_direction(0)) > -wrap:
+        shadow = lit(mesh, point, normal_in, light_direction(0))
     for i in range(3):
         light = light_direction(i)
         reach = (0.35 + 0.65 * marks[2]) * wp.where(i == 0, shadow, 1.0)
         facing = wp.max((wp.dot(normal, light) + wrap) / (1.0 + wrap), 0.0)
-        skin_gloss = (1.0 - hair) * gloss(normal, view, light, power, base) * wp.max(wp.dot(normal, light), 0.0)
-        fibre = hair * hair_gloss(flow, normal, view, light, 0.12 + 0.25 * threads) * facing
-        sheen = wp.cw_mul(light_color(i), wp.vec3(1.0, 1.0, 1.0) * skin_gloss + fibre * (look.hair_light + wp.vec3(0.1, 0.1, 0.1)))
+        skin_gloss = wp.float32(0.0)
+        if hair < 1.0:
+            skin_gloss = (1.0 - hair) * gloss(normal, view, light, power, base) * wp.max(wp.dot(normal, light), 0.0)
+        fibre = wp.float32(0.0)
+        if hair > 0.0:
+            fibre = hair * hair_gloss(flow, normal, view, light, 0.12 + 0.25 * threads) * facing
+        sheen = wp.cw_mul(light_color(i), wp.vec3(1.0, 1.0, 1.0) * skin_gloss + fibre * (1.2 * look.hair_light + wp.vec3(0.03, 0.03, 0.03)))
         total += (wp.cw_mul(color, light_color(i)) * (0.75 * facing) + sheen) * reach
     return encode(total)
 
@@ -288,7 +343,7 @@ def _portrait_kernel(
     high = wp.vec4()
     count = wp.int32(0)
     for s in range(samples.shape[0]):
-        if s == 4 and wp.length(high - low) < 0.10:
+        if s == 4 and wp.length(high - low) < 0.14:
             break
         xy = wp.cw_div(corner + samples[s] - view.center, view.focal)
         direction = wp.normalize(view.to_world @ wp.vec3(xy[0], xy[1], 1.0))

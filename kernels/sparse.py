@@ -20,8 +20,6 @@ from torch.autograd.function import once_differentiable
 from mgavatar.kernels.bridge import launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype, pick
 
-wp.set_module_options({"enable_backward": False})
-
 _LIMIT = 2**31 - 1  # indices are int32
 _SEGMENT = 512  # entries that one item adds up; longer rows are added in two stages, for threads and for accuracy
 

@@ -1,0 +1,273 @@
+"""Every number of a fit. Defaults are the paper's where it gives one; ``configs/*.toml`` lists what a preset changes.
+
+Where the paper is silent the value is the field's or was measured; ``docs/choices.md`` has the reasons.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from mgavatar.errors import DataError
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageLossConfig:
+    """Photometric loss (Eq. 4)."""
+
+    color: float = 0.8
+    """Weight of the mean absolute error, lambda_c."""
+    ssim: float = 0.2
+    """Weight of 1 - SSIM, lambda_m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeometryConfig:
+    """Geometry stage (Section 3.1): vertex-bound Gaussians move the mesh."""
+
+    iterations: int = 100_000
+    subdivisions: int = 1
+    """Midpoint subdivisions of the head model; the paper goes from 5K to 20K vertices with one."""
+    lr_refine: float = 1e-3
+    """RefineNet: triplane, Phi_id and Phi_pose."""
+    lr_shape: float = 1e-2
+    """Identity coefficients beta."""
+    lr_expr: float = 1e-3
+    """Expression coefficients psi of each timestep."""
+    lr_pose: float = 1e-5
+    """Rotations theta of each timestep."""
+    lr_translation: float = 1e-6
+    lr_scale: float = 5e-3
+    """Logarithm of the Gaussians' scales."""
+    lr_color: float = 2e-2
+    final_lr: float = 0.1
+    """All rates fall exponentially to this share of themselves."""
+    lambda_offset: float = 10.0
+    """Weight of Eq. 5, lambda_o; its norms are squared lengths [m^2] averaged over vertices."""
+    lambda_laplacian: float = 1e5
+    """Weight of Eq. 6, lambda_l; norms as in Eq. 5, Laplacian = vertex minus mean of its neighbours."""
+    triplane_resolution: int = 128
+    triplane_channels: int = 16
+    hidden: int = 128
+    """Channels of the 4-layer networks."""
+    pose_offsets: bool = True
+    """Learn Phi_pose (Eq. 2)."""
+    offset_unit: float = 0.01
+    """What an output of 1 of Phi_id and Phi_pose means [m]."""
+    surface_shift: float = 1.0
+    """Gaussians are drawn this many of their own sigma behind the surface: opaque Gaussians look larger than the
+    surface that carries them. Not in the paper, which is 0."""
+    initial_scale: float = 0.5
+    """Sigma of a Gaussian at the start, in mean lengths of the edges at its vertex."""
+    start_from_tracked_shape: bool = True
+    """Start beta at the capture's ``shape``; otherwise at the neutral template."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DensityConfig:
+    """Adaptive density control of the face-bound Gaussians."""
+
+    start: int = 10_000
+    stop: int = 200_000
+    every: int = 2_000
+    gradient: float = 2e-4
+    """Mean norm of the gradient of the image-space mean, in half image sizes, above which a Gaussian is refined."""
+    split_scale: float = 0.01
+    """Larger Gaussians are split, smaller ones cloned; in diagonals of the mesh's bounding box."""
+    min_opacity: float = 0.005
+    max_gaussians: int = 400_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ColorNetConfig:
+    """Grid-based neural colour field (Eq. 9)."""
+
+    levels: int = 16
+    base_resolution: int = 16
+    max_resolution: int = 4096
+    log2_table_size: int = 19
+    hidden: int = 64
+    """Channels of the 2-layer network."""
+    view_frame: Literal["canonical", "world"] = "canonical"
+    """The view direction is carried into the canonical frame of the Gaussian's face, or stays in the world."""
+    lr: float = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffsetNetConfig:
+    """Convolutional offset network (Eq. 10)."""
+
+    enabled: bool = True
+    resolution: int = 256
+    """Height and width of the UV maps."""
+    channels: int = 64
+    lr: float = 1e-4
+    regularize: float = 0.01
+    """Weight of the offset maps' squared mean, lambda_a in Eq. 11."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AppearanceConfig:
+    """Appearance stage (Section 3.2): face-bound Gaussians on the frozen mesh."""
+
+    iterations: int = 240_000
+    lr_means: float = 5e-3
+    """Local centres, in units of the face's scale k."""
+    lr_scales: float = 1.7e-2
+    lr_quats: float = 1e-3
+    lr_opacities: float = 5e-2
+    final_lr: float = 0.1
+    """All rates fall exponentially to this share of themselves."""
+    initial_scale: float = 0.5
+    """Sigma along the face at the start, in units of k."""
+    initial_thickness: float = 0.2
+    """Sigma across the face at the start, in units of k."""
+    initial_opacity: float = 0.9
+    lambda_position: float = 0.01
+    """lambda_mu in Eq. 11."""
+    lambda_scale: float = 1.0
+    """lambda_s in Eq. 11."""
+    epsilon_position: float = 1.0
+    """Free radius of the local position, epsilon_mu, in units of k."""
+    epsilon_scale: float = 0.6
+    """Free size of the local scale, epsilon_s, in units of k."""
+    density: DensityConfig = field(default_factory=DensityConfig)
+    color_net: ColorNetConfig = field(default_factory=ColorNetConfig)
+    offset_net: OffsetNetConfig = field(default_factory=OffsetNetConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterConfig:
+    """What the rasterizer may leave out (``kernels/rasterize.py``)."""
+
+    alpha_threshold: float = 1.0 / 255.0
+    stop: float = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitConfig:
+    """A whole fit."""
+
+    image_scale: float = 1.0
+    """Images are reduced to this share of their size for fitting; evaluation is always at full size."""
+    principal_point: Literal["center", "opencv", "opengl"] = "center"
+    """Where the capture's principal point is: the centre (as GaussianAvatars assumes), or cx, cy counted from the
+    top (opencv) or from the bottom (opengl)."""
+    log_every: int = 20
+    """Iterations between lines of ``metrics.jsonl``."""
+    checkpoint_minutes: float = 5.0
+    loss: ImageLossConfig = field(default_factory=ImageLossConfig)
+    geometry: GeometryConfig = field(default_factory=GeometryConfig)
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
+
+
+def preset_names() -> list[str]:
+    """Presets that are installed with the program."""
+    files = resources.files("mgavatar.configs").iterdir()
+    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
+
+
+def read_preset(preset: str) -> dict[str, Any]:
+    """The table of a preset, by name or by the path of a ``.toml`` file.
+
+    Raises:
+        DataError: If there is no such preset, or the file is not TOML.
+    """
+    if preset.endswith(".toml"):
+        source: Any = Path(preset)
+        if not source.is_file():
+            raise DataError(f"{preset}: no such file; give a preset ({', '.join(preset_names())}) or a .toml file")
+    elif preset in preset_names():
+        source = resources.files("mgavatar.configs") / f"{preset}.toml"
+    else:
+        raise DataError(f"no preset '{preset}'; there are {', '.join(preset_names())}, or a path ending in .toml")
+    try:
+        return tomllib.loads(source.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{preset}: not a TOML file ({error})") from error
+
+
+def preset_flags(table: dict[str, Any], prefix: str = "") -> list[str]:
+    """A preset as command line flags, so that one parser checks both (and suggests the nearest key)."""
+    flags: list[str] = []
+    for key, value in table.items():
+        name = f"{prefix}{key}".replace("_", "-")
+        if isinstance(value, dict):
+            flags += preset_flags(value, f"{prefix}{key}.")
+        elif isinstance(value, bool):
+            head, _, tail = name.rpartition(".")
+            flags.append(f"--{name}" if value else f"--{head}.no-{tail}" if head else f"--no-{tail}")
+        else:
+            flags.append(f"--{name}={value}")
+    return flags
+
+
+def to_toml(config: Any, prefix: str = "") -> str:
+    """A config as TOML that :func:`read_preset` reads back."""
+    plain, nested = [], []
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            nested.append(f"\n[{prefix}{entry.name}]\n{to_toml(value, f'{prefix}{entry.name}.')}")
+        else:
+            text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+            plain.append(f"{entry.name} = {text}\n")
+    return "".join(plain + nested)
+
+
+def from_dict(table: dict[str, Any], kind: type = FitConfig) -> Any:
+    """The inverse of ``dataclasses.asdict``, for configs stored in an avatar.
+
+    Raises:
+        ValueError: If the table has a key that the config lacks.
+    """
+    fields = {entry.name: entry for entry in dataclasses.fields(kind)}
+    unknown = sorted(set(table) - set(fields))
+    if unknown:
+        raise ValueError(f"unknown key {unknown[0]}")
+    values = {}
+    for name, value in table.items():
+        default = fields[name].default_factory
+        nested = default() if default is not dataclasses.MISSING else None
+        values[name] = from_dict(value, type(nested)) if dataclasses.is_dataclass(nested) else value
+    return kind(**values)
+
+
+def check(config: FitConfig) -> None:
+    """Refuse numbers that cannot work.
+
+    Raises:
+        DataError: Naming the key and its range.
+    """
+    g, a = config.geometry, config.appearance
+    bounds = (
+        ("image-scale", config.image_scale, 0.01, 1.0),
+        ("geometry.iterations", g.iterations, 1, 10_000_000),
+        ("geometry.subdivisions", g.subdivisions, 0, 3),
+        ("geometry.triplane-resolution", g.triplane_resolution, 2, 1024),
+        ("geometry.hidden", g.hidden, 1, 4096),
+        ("geometry.final-lr", g.final_lr, 1e-6, 1.0),
+        ("geometry.initial-scale", g.initial_scale, 0.01, 10.0),
+        ("appearance.iterations", a.iterations, 1, 10_000_000),
+        ("appearance.final-lr", a.final_lr, 1e-6, 1.0),
+        ("appearance.initial-opacity", a.initial_opacity, 0.01, 0.999),
+        ("appearance.color-net.levels", a.color_net.levels, 1, 32),
+        ("appearance.color-net.log2-table-size", a.color_net.log2_table_size, 4, 24),
+        ("appearance.offset-net.resolution", a.offset_net.resolution, 16, 1024),
+        ("appearance.density.every", a.density.every, 1, 10_000_000),
+        ("raster.alpha-threshold", config.raster.alpha_threshold, 0.0, 0.5),
+        ("raster.stop", config.raster.stop, 0.0, 0.5),
+        ("log-every", config.log_every, 1, 10_000_000),
+    )
+    for name, value, low, high in bounds:
+        if not low <= value <= high:
+            raise DataError(f"--{name} {value}: must lie between {low:g} and {high:g}")
+    if a.offset_net.resolution % 8:
+        raise DataError(f"--appearance.offset-net.resolution {a.offset_net.resolution}: must be a multiple of 8")
+    if a.color_net.max_resolution < a.color_net.base_resolution:
+        raise DataError("--appearance.color-net.max-resolution: must not be below base-resolution")

@@ -1,0 +1,64 @@
+"""RefineNet: vertex offsets from a triplane (Section 3.1, Eq. 1 and 2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mgavatar.config import GeometryConfig
+from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
+from mgavatar.kernels.uv_map import uv_sampler
+
+N_POSE = 12
+"""Neck, jaw and both eyes: the rotations that Phi_pose sees."""
+
+
+def _mlp(n_in: int, hidden: int) -> nn.Sequential:
+    """Four layers to a 3-vector; the last starts at zero, so training starts at the template."""
+    layers = nn.Sequential(
+        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
+        nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3),
+    )  # fmt: skip
+    nn.init.zeros_(layers[-1].weight)
+    nn.init.zeros_(layers[-1].bias)
+    return layers
+
+
+class RefineNet(nn.Module):
+    """Identity and pose offsets of every vertex.
+
+    Vertices keep their place in the triplane, so sampling it is a fixed matrix.
+    """
+
+    def __init__(self, v_template: Tensor, config: GeometryConfig) -> None:
+        """Encode the vertices of the fine template, shape [V, 3]."""
+        super().__init__()
+        resolution, channels = config.triplane_resolution, config.triplane_channels
+        self.unit = config.offset_unit
+        self.planes = nn.Parameter(0.1 * torch.randn(3, resolution**2, channels))
+        self.phi_id = _mlp(3 * channels, config.hidden)
+        self.phi_pose = _mlp(3 * channels + N_POSE, config.hidden) if config.pose_offsets else None
+        low, high = v_template.min(0).values, v_template.max(0).values
+        place = ((v_template - low) / (high - low).max()).cpu()
+        pairs = ((0, 1), (1, 2), (2, 0))
+        self._samplers: list[SparseMatrix] = [
+            uv_sampler(place[:, list(pair)].contiguous(), resolution, resolution).to(v_template.device) for pair in pairs
+        ]
+
+    def encode(self) -> Tensor:
+        """Triplane features of all vertices, ``E_tri(mu_0)``, shape [V, 3 channels]."""
+        return torch.cat([sparse_apply(s, plane) for s, plane in zip(self._samplers, self.planes, strict=True)], 1)
+
+    def identity_offsets(self, features: Tensor) -> Tensor:
+        """Eq. 1: ``delta mu_id`` [m], shape [V, 3]."""
+        return self.unit * self.phi_id(features)
+
+    def pose_offsets(self, features: Tensor, pose: Tensor) -> Tensor:
+        """Eq. 2: ``delta mu_pose`` [m] from neck, jaw and eye rotations [12], shape [V, 3]; zero if switched off."""
+        if self.phi_pose is None:
+            return torch.zeros(len(features), 3, device=features.device)
+        first = self.phi_pose[0]
+        n = features.shape[1]
+        # The pose is the same for all vertices: its share of the first layer is one vector.
+        hidden = features @ first.weight[:, :n].T + (first.weight[:, n:] @ pose + first.bias)
+        return self.unit * self.phi_pose[1:](hidden)

@@ -1,0 +1,112 @@
+"""The geometry stage: vertex-bound Gaussians pull the mesh onto the images (Section 3.1, Eq. 4 to 7)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mgavatar.camera import Camera
+from mgavatar.config import FitConfig
+from mgavatar.gaussians import SH_C0, Gaussians, draw
+from mgavatar.geometry.head import PersonalHead, PosedHead
+from mgavatar.kernels.laplacian import laplacian
+from mgavatar.kernels.rasterize import Rendering
+from mgavatar.losses import image_loss
+
+
+class VertexGaussians(nn.Module):
+    """One Gaussian a vertex with reduced freedom: no rotation, one scale, opacity 1, SH degree 0 colour."""
+
+    def __init__(self, head: PersonalHead, config: FitConfig) -> None:
+        super().__init__()
+        self.head = head
+        self.config = config
+        edges = head.body.edge_lengths(head.body.shaped(head.betas.detach()))
+        typical = edges[edges > 0].median()
+        self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges.clamp(min=0.2 * typical)))
+        self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
+
+    def bound(self, posed: PosedHead) -> Gaussians:
+        """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas."""
+        verts = posed.verts
+        scales = self.log_scales.exp()
+        shift = self.config.geometry.surface_shift
+        if shift:
+            verts = verts - shift * scales.detach()[:, None] * self.head.body.normals(verts)
+        n = len(verts)
+        quats = torch.zeros(n, 4, device=verts.device)
+        quats[:, 0] = 1.0
+        ones = torch.ones(n, device=verts.device)
+        return Gaussians(verts, quats, scales[:, None].expand(n, 3), ones, 0.5 + SH_C0 * self.colors)
+
+    def render(self, posed: PosedHead, camera: Camera, background: Tensor) -> Rendering:
+        return draw(self.bound(posed), camera, background=background, config=self.config.raster)
+
+
+def offset_loss(posed: PosedHead, scales: Tensor) -> Tensor:
+    """Eq. 5; squared lengths [m^2] averaged over vertices."""
+    identity, by_pose = posed.identity_offsets, posed.pose_offsets
+    return identity.square().sum(1).mean() + by_pose.square().sum(1).mean() + scales.square().mean()
+
+
+def laplacian_loss(gaussians: VertexGaussians, posed: PosedHead, scales: Tensor) -> Tensor:
+    """Eq. 6; the Laplacian is linear, so differences to the parametric mesh are Laplacians of the offsets."""
+    matrix = gaussians.head.body.laplacian
+    offsets = torch.cat([posed.identity_offsets, posed.identity_offsets + posed.pose_offsets, scales[:, None]], 1)
+    return laplacian(matrix, offsets).square().sum(1).mean()
+
+
+class GeometryStage:
+    """One optimizer step at a time."""
+
+    name = "geometry"
+
+    def __init__(self, gaussians: VertexGaussians, config: FitConfig) -> None:
+        self.gaussians = gaussians
+        self.config = config
+        self.iterations = config.geometry.iterations
+        g, head = config.geometry, gaussians.head
+        poses = head.poses
+        groups = [
+            {"params": list(head.refine.parameters()), "lr": g.lr_refine},
+            {"params": [head.betas], "lr": g.lr_shape},
+            {"params": [poses["expr"]], "lr": g.lr_expr},
+            {"params": [poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": g.lr_pose},
+            {"params": [poses["translation"]], "lr": g.lr_translation},
+            {"params": [gaussians.log_scales], "lr": g.lr_scale},
+            {"params": [gaussians.colors], "lr": g.lr_color},
+        ]
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        decay = g.final_lr ** (1.0 / max(1, g.iterations))
+        self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimizer, decay)
+
+    def step(self, camera: Camera, timestep: int, target: Tensor, background: Tensor) -> dict[str, float]:
+        """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss."""
+        g = self.config.geometry
+        head = self.gaussians.head
+        posed = head.posed(head.pose(timestep))
+        image = self.gaussians.render(posed, camera, background).image
+        scales = self.gaussians.log_scales.exp()
+        image_term = image_loss(image, target, self.config.loss)
+        offset_term = g.lambda_offset * offset_loss(posed, scales)
+        laplacian_term = g.lambda_laplacian * laplacian_loss(self.gaussians, posed, scales)
+        loss = image_term + offset_term + laplacian_term
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        self.schedule.step()
+        terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()
+        return dict(zip(("loss", "image", "offset", "laplacian"), terms, strict=True)) | {"gaussians": len(scales)}
+
+    def state_dict(self) -> dict[str, object]:
+        """Everything a later process needs to go on."""
+        return {
+            "gaussians": self.gaussians.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, dict]) -> None:
+        self.gaussians.load_state_dict(state["gaussians"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.schedule.load_state_dict(state["schedule"])

@@ -1,0 +1,168 @@
+"""A head model as tensors on a device: shape it, express it, pose it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mgavatar.capture.subject import HeadParams
+from mgavatar.head.model import HeadModel
+from mgavatar.head.subdivide import subdivide
+from mgavatar.kernels.laplacian import laplacian_matrix
+from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
+from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """One timestep of FLAME parameters as tensors; angles are rotation vectors [rad].
+
+    Attributes:
+        expr: Shape [E].
+        rotation: Shape [3].
+        neck: Shape [3].
+        jaw: Shape [3].
+        eyes: Left, then right, shape [6].
+        translation: Metres, shape [3].
+    """
+
+    expr: Tensor
+    rotation: Tensor
+    neck: Tensor
+    jaw: Tensor
+    eyes: Tensor
+    translation: Tensor
+
+    def joint_rotations(self) -> Tensor:
+        """Rotation vectors of root, neck, jaw and both eyes, shape [5, 3]."""
+        return torch.cat([self.rotation, self.neck, self.jaw, self.eyes]).reshape(5, 3)
+
+    def centered(self) -> Pose:
+        """The same face without root rotation and translation."""
+        zero = torch.zeros_like(self.rotation)
+        return Pose(self.expr, zero, self.neck, self.jaw, self.eyes, zero)
+
+    def to(self, device: torch.device) -> Pose:
+        return Pose(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+def fitted(values: np.ndarray, n: int) -> np.ndarray:
+    """Coefficients cut or padded with zeros along the last axis to ``n``, float32."""
+    out = np.zeros((*values.shape[:-1], n), np.float32)
+    width = min(n, values.shape[-1])
+    out[..., :width] = values[..., :width]
+    return out
+
+
+def pose_of(params: HeadParams, timestep: int, n_expr: int) -> Pose:
+    """Row ``timestep`` of tracked parameters, with as many expression coefficients as the head has."""
+    rows = (fitted(params.expr, n_expr), params.rotation, params.neck_pose, params.jaw_pose, params.eyes_pose)
+    return Pose(*(torch.from_numpy(row[timestep].copy()) for row in (*rows, params.translation)))
+
+
+class Body:
+    """The subdivided head. Directions are linear, so they are evaluated on the base mesh and then carried over.
+
+    Attributes:
+        model: The head model as given.
+        fine: The same after subdivision, without its directions.
+    """
+
+    def __init__(self, model: HeadModel, *, subdivisions: int, device: torch.device | str = "cpu") -> None:
+        self.model = model
+        self.subdivisions = subdivisions
+        self.device = torch.device(device)
+        self.fine, steps = _subdivided(model, subdivisions)
+        self._subdivision = [step.to(self.device) for step in steps]
+        self.v_template = self._tensor(model.v_template)
+        dirs = np.moveaxis(model.shapedirs, 2, 0)
+        self.shape_dirs = self._tensor(dirs[: model.n_shape])
+        self.expr_dirs = self._tensor(dirs[model.n_shape :])
+        self.pose_dirs = self._tensor(np.moveaxis(model.posedirs, 2, 0))
+        self.has_pose_dirs = bool(np.any(model.posedirs))
+        self.J_regressor = self._tensor(model.J_regressor)
+        self.parents = torch.tensor(model.parents, dtype=torch.int32, device=self.device)
+        self.lbs_weights = self._tensor(self.fine.lbs_weights)
+        self.faces = torch.tensor(self.fine.faces, dtype=torch.int32, device=self.device)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.tensor(array, dtype=torch.float32, device=self.device)
+
+    @property
+    def n_verts(self) -> int:
+        return len(self.fine.v_template)
+
+    @cached_property
+    def laplacian(self) -> SparseMatrix:
+        """Neighbour-mean Laplacian of the fine mesh."""
+        return laplacian_matrix(self.faces, self.n_verts).to(self.device)
+
+    @cached_property
+    def _corner_sum(self) -> SparseMatrix:
+        corners = self.faces.reshape(-1).long().cpu()
+        n_faces = len(self.faces)
+        columns = torch.arange(n_faces).repeat_interleave(3)
+        return SparseMatrix.from_coo(corners, columns, torch.ones(3 * n_faces), (self.n_verts, n_faces)).to(self.device)
+
+    def carry(self, values: Tensor) -> Tensor:
+        """Per-vertex values of the base mesh, carried to the fine one; shape [V_base, C] to [V, C]."""
+        for step in self._subdivision:
+            values = sparse_apply(step, values)
+        return values
+
+    def shaped(self, betas: Tensor) -> Tensor:
+        """The neutral head of an identity, ``T{beta}`` of Section 3.1; [n_shape] to [V, 3], metres."""
+        return self.carry(blend_shapes(self.v_template, self.shape_dirs, betas))
+
+    def joints(self, canonical: Tensor) -> Tensor:
+        """Joints of a canonical head [m], shape [5, 3]; identity offsets move them, as in VHAP."""
+        return self.J_regressor @ canonical[: len(self.v_template)]
+
+    def posed(self, verts: Tensor, pose: Pose, *, joints: Tensor) -> Tensor:
+        """Express and pose a neutral head (FLAME's forward pass).
+
+        Args:
+            verts: Neutral vertices with all offsets [m], shape [V, 3].
+            pose: Expression and rotations.
+            joints: Rest joints [m], shape [5, 3].
+
+        Returns:
+            Vertices in world space [m], shape [V, 3].
+        """
+        transforms, pose_feature = joint_transforms(joints, pose.joint_rotations(), self.parents)
+        moved = blend_shapes(torch.zeros_like(self.v_template), self.expr_dirs, pose.expr)
+        if self.has_pose_dirs:
+            moved = blend_shapes(moved, self.pose_dirs, pose_feature)
+        return skin(verts + self.carry(moved), self.lbs_weights, transforms) + pose.translation
+
+    def normals(self, verts: Tensor) -> Tensor:
+        """Unit vertex normals, areas as weights, shape [V, 3]; zero where a vertex has no face. No gradient."""
+        with torch.no_grad():
+            a, b, c = verts[self.faces.long()].unbind(1)
+            normals = sparse_apply(self._corner_sum, torch.cross(b - a, c - a, dim=1))
+            return torch.nn.functional.normalize(normals, dim=1)
+
+    def edge_lengths(self, verts: Tensor) -> Tensor:
+        """Mean length of the edges at each vertex [m], shape [V]. No gradient."""
+        with torch.no_grad():
+            a, b, c = verts[self.faces.long()].unbind(1)
+            mean = ((b - a).norm(dim=1) + (c - b).norm(dim=1) + (a - c).norm(dim=1)) / 3
+            total = sparse_apply(self._corner_sum, torch.stack([mean, torch.ones_like(mean)], 1))
+            return total[:, 0] / total[:, 1].clamp(min=1.0)
+
+
+def _subdivided(model: HeadModel, times: int) -> tuple[HeadModel, list[SparseMatrix]]:
+    """The fine mesh without its directions, and the matrices that carry vertices to it one step at a time."""
+    fine = replace(model, shapedirs=model.shapedirs[:, :, :0], posedirs=model.posedirs[:, :, :0], n_shape=0, n_expr=0)
+    steps = []
+    for _ in range(times):
+        n_verts = len(fine.v_template)
+        fine, parents = subdivide(fine)
+        rows = torch.arange(len(parents)).repeat_interleave(2)
+        columns, halves = torch.from_numpy(parents.reshape(-1)), torch.full((len(rows),), 0.5)
+        steps.append(SparseMatrix.from_coo(rows, columns, halves, (len(parents), n_verts)))
+    return fine, steps
