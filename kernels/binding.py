@@ -28,7 +28,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     module = f"{__name__}.{real.name}"
 
     @wp.func
-    def any_normal(direction: vec3):
+    def any_normal(direction: vec3) -> vec3:
         """A unit vector at right angles to a unit ``direction``."""
         helper = vec3(one, zero, zero)
         if wp.abs(direction[0]) > half:
@@ -36,8 +36,8 @@ def _kernels(real: Real) -> SimpleNamespace:
         return wp.normalize(wp.cross(direction, helper))
 
     @wp.func
-    def quat_of_axes(x: vec3, y: vec3, z: vec3):
-        """Quaternion wxyz of the rotation with these columns, divided by its largest component's square root."""
+    def quat_of_axes(x: vec3, y: vec3, z: vec3) -> vec4:
+        """Quaternion wxyz of the rotation with these columns, of which no component is divided by a small number."""
         trace = x[0] + y[1] + z[2]
         q = vec4(one + trace, y[2] - z[1], z[0] - x[2], x[1] - y[0])
         if trace < zero:
@@ -50,14 +50,14 @@ def _kernels(real: Real) -> SimpleNamespace:
         return q / wp.length(q)
 
     @wp.func
-    def rotate(q: vec4, v: vec3):
+    def rotate(q: vec4, v: vec3) -> vec3:
         """Rotate ``v`` by a unit quaternion wxyz."""
         axis = vec3(q[1], q[2], q[3])
         t = two * wp.cross(axis, v)
         return v + q[0] * t + wp.cross(axis, t)
 
     @wp.func
-    def quat_product(p: vec4, q: vec4):
+    def quat_product(p: vec4, q: vec4) -> vec4:
         """Hamilton product of quaternions wxyz."""
         return vec4(
             p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
@@ -74,7 +74,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         quats: wp.array(dtype=vec4),  # [F]
         scales: wp.array(dtype=scalar),  # [F]
         centers: wp.array(dtype=vec3),  # [F]
-    ):
+    ) -> None:
         f = wp.tid()
         a = corners[f, 0]
         edge = corners[f, 1] - a
@@ -108,7 +108,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         means: wp.array(dtype=vec3),  # [N]
         quats: wp.array(dtype=vec4),  # [N]
         scales: wp.array(dtype=vec3),  # [N]
-    ):
+    ) -> None:
         n = wp.tid()
         q = face_quats[n]
         k = face_scales[n]

@@ -206,7 +206,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         table: wp.array2d(dtype=scalar),
         levels: wp.array2d(dtype=int),
         out: wp.array2d(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @native(_LOCATE + _TABLE_BWD.replace("ADD", _ADD_REAL))
     def add_table_gradient(
@@ -219,7 +219,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         levels: wp.array2d(dtype=int),
         sums: wp.array2d(dtype=scalar),
         marks: wp.array(dtype=wp.uint8),
-    ): ...
+    ) -> None: ...
 
     @native(_LOCATE + _TABLE_BWD.replace("ADD", _ADD_FIXED))
     def add_fixed_gradient(
@@ -233,7 +233,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         levels: wp.array2d(dtype=int),
         sums: wp.array2d(dtype=wp.int64),
         marks: wp.array(dtype=wp.uint8),
-    ): ...
+    ) -> None: ...
 
     @native(_LOCATE + _POINTS_BWD)
     def add_point_gradient(
@@ -246,7 +246,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         grad: wp.array2d(dtype=scalar),
         levels: wp.array2d(dtype=int),
         grad_points: wp.array2d(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @native(_ADAM)
     def adam_range(
@@ -262,7 +262,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         grad: wp.array2d(dtype=scalar),
         means: wp.array2d(dtype=scalar),
         squares: wp.array2d(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=module, enable_backward=False)
     def encode_kernel(
@@ -274,14 +274,12 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         levels: wp.array2d(dtype=int),  # [L, 3]
         # Out:
         out: wp.array2d(dtype=scalar),  # [N, L F]
-    ):
+    ) -> None:
         n = points.shape[0]
         n_ranges = (n + width - 1) // width
         item = first + wp.tid()
         begin = item % n_ranges * width
-        encode_range(
-            item // n_ranges, levels.shape[0], begin, wp.min(begin + width, n), points, table, levels, out
-        )
+        encode_range(item // n_ranges, levels.shape[0], begin, wp.min(begin + width, n), points, table, levels, out)
 
     @wp.kernel(module=module, enable_backward=False)
     def table_bwd_kernel(
@@ -293,7 +291,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         # Out, sums of one level an item:
         sums: wp.array2d(dtype=scalar),  # [T, F]
         marks: wp.array(dtype=wp.uint8),  # [T / block]
-    ):
+    ) -> None:
         level = first + wp.tid()
         add_table_gradient(level, levels.shape[0], 0, points.shape[0], points, grad, levels, sums, marks)
 
@@ -307,7 +305,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         # Out, sums over all points:
         sums: wp.array2d(dtype=wp.int64),  # [T, F]
         marks: wp.array(dtype=wp.uint8),  # [T / block]
-    ):
+    ) -> None:
         level, n = wp.tid()
         add_fixed_gradient(level, levels.shape[0], n, n + 1, points, grad, scale, levels, sums, marks)
 
@@ -319,7 +317,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         # In and out:
         fixed: wp.array2d(dtype=wp.int64),  # [T, F], left at zero
         sums: wp.array2d(dtype=scalar),  # [T, F]
-    ):
+    ) -> None:
         t, f = wp.tid()
         if marks[t // wp.static(_BLOCK)] != wp.uint8(0):
             sums[t, f] = sums[t, f] + scalar(wp.float64(fixed[t, f]) / scale[0])
@@ -336,7 +334,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         levels: wp.array2d(dtype=int),  # [L, 3]
         # Out, sums that start at zero:
         grad_points: wp.array2d(dtype=scalar),  # [N, 3]
-    ):
+    ) -> None:
         begin = (first + wp.tid()) * width
         end = wp.min(begin + width, points.shape[0])
         n_levels = levels.shape[0]
@@ -359,7 +357,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         grad: wp.array2d(dtype=scalar),  # [T, F], left at zero
         means: wp.array2d(dtype=scalar),  # [T, F]
         squares: wp.array2d(dtype=scalar),  # [T, F]
-    ):
+    ) -> None:
         begin = wp.int64(first + wp.tid()) * wp.int64(width)
         end = wp.min(begin + wp.int64(width), wp.int64(table.shape[0]) * wp.int64(table.shape[1]))
         adam_range(begin, end, rate, unbias, beta1, beta2, eps, marks, table, grad, means, squares)
@@ -466,7 +464,9 @@ class HashGridShape:
             ValueError: If a number is out of range.
         """
         if self.levels < 1 or not 1 <= self.features <= 8:
-            raise ValueError(f"a hash grid needs 1 level or more and 1 to 8 features, got {self.levels}, {self.features}")
+            raise ValueError(
+                f"a hash grid needs 1 level or more and 1 to 8 features, got {self.levels}, {self.features}"
+            )
         if not 1 <= self.base_resolution <= self.max_resolution <= 2**20:
             raise ValueError(f"resolutions must be 1 <= base <= max <= 2^20, got {self}")
         if not 1 <= self.log2_table_size <= 24:

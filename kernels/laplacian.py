@@ -33,7 +33,9 @@ def laplacian_matrix(faces: Tensor, n_verts: int) -> SparseMatrix:
     rows, cols = keys // n_verts, keys % n_verts
     degree = torch.bincount(rows, minlength=n_verts)
     linked = torch.nonzero(degree).flatten()
-    values = torch.cat([torch.ones(len(linked), device=faces.device, dtype=torch.float64), -1.0 / degree[rows].double()])
+    values = torch.cat(
+        [torch.ones(len(linked), device=faces.device, dtype=torch.float64), -1.0 / degree[rows].double()]
+    )
     return SparseMatrix.from_coo(torch.cat([linked, rows]), torch.cat([linked, cols]), values, (n_verts, n_verts))
 
 

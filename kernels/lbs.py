@@ -41,7 +41,8 @@ _BLEND_SNIPPET = """
         }
         if (filled == 4) {
             const REAL c0 = c[0], c1 = c[1], c2 = c[2], c3 = c[3];
-            const REAL *__restrict__ d0 = d[0], *__restrict__ d1 = d[1], *__restrict__ d2 = d[2], *__restrict__ d3 = d[3];
+            const REAL *__restrict__ d0 = d[0], *__restrict__ d1 = d[1];
+            const REAL *__restrict__ d2 = d[2], *__restrict__ d3 = d[3];
             for (long long i = 0; i < count; ++i)
                 sums[i] += (c0 * d0[i] + c1 * d1[i]) + (c2 * d2[i] + c3 * d3[i]);
             filled = 0;
@@ -93,7 +94,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         coeffs: wp.array(dtype=scalar),
         start: wp.array(dtype=scalar),
         out: wp.array(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @native(_DOT_SNIPPET)
     def dot_direction(
@@ -103,7 +104,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         dirs: wp.array2d(dtype=scalar),
         grad: wp.array(dtype=scalar),
         partial: wp.array2d(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=module, enable_backward=False)
     def blend_kernel(
@@ -115,7 +116,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         start: wp.array(dtype=scalar),  # [3V]
         # Out:
         out: wp.array(dtype=scalar),  # [3V]
-    ):
+    ) -> None:
         add_directions(first + wp.tid(), width, dirs, coeffs, start, out)
 
     @wp.kernel(module=module, enable_backward=False)
@@ -127,7 +128,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         grad: wp.array(dtype=scalar),  # [3V]
         # Out:
         partial: wp.array2d(dtype=scalar),  # [K, lanes]
-    ):
+    ) -> None:
         begin = (first + wp.tid()) * width
         dot_direction(begin // wp.static(_LANES), begin % wp.static(_LANES), width, dirs, grad, partial)
 
@@ -137,7 +138,7 @@ def _blend_kernels(real: Real, module: str) -> SimpleNamespace:
         partial: wp.array2d(dtype=scalar),  # [M, N]
         # Out:
         out: wp.array(dtype=scalar),  # [M]
-    ):
+    ) -> None:
         m = wp.tid()
         total = scalar(0.0)
         for n in range(partial.shape[1]):
@@ -153,7 +154,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
     mat34 = wp.types.matrix((3, 4), scalar)
 
     @wp.func
-    def blended(v: int, weights: wp.array2d(dtype=scalar), transforms: wp.array(dtype=mat44)):
+    def blended(v: int, weights: wp.array2d(dtype=scalar), transforms: wp.array(dtype=mat44)) -> mat44:
         """The transform of a vertex: its joints' transforms by their weights."""
         total = mat44()
         for j in range(transforms.shape[0]):
@@ -169,7 +170,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         transforms: wp.array(dtype=mat44),  # [J]
         # Out:
         out: wp.array(dtype=vec3),  # [V]
-    ):
+    ) -> None:
         v = first + wp.tid()
         p = verts[v]
         q = blended(v, weights, transforms) @ vec4(p[0], p[1], p[2], scalar(1.0))
@@ -184,7 +185,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         grad: wp.array(dtype=vec3),  # [V]
         # Out:
         grad_verts: wp.array(dtype=vec3),  # [V]
-    ):
+    ) -> None:
         v = first + wp.tid()
         g = grad[v]
         q = wp.transpose(blended(v, weights, transforms)) @ vec4(g[0], g[1], g[2], scalar(0.0))
@@ -199,7 +200,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         grad: wp.array(dtype=vec3),  # [V]
         # Out:
         partial: wp.array2d(dtype=mat34),  # [J, chunks]
-    ):
+    ) -> None:
         item = first + wp.tid()
         j = item // partial.shape[1]
         chunk = item % partial.shape[1]
@@ -215,7 +216,7 @@ def _skin_kernels(real: Real, module: str) -> SimpleNamespace:
         partial: wp.array2d(dtype=mat34),  # [J, chunks]
         # Out:
         grad_transforms: wp.array3d(dtype=scalar),  # [J, 4, 4]
-    ):
+    ) -> None:
         j, r, c = wp.tid()
         total = scalar(0.0)
         if r < 3:
@@ -243,7 +244,7 @@ class _BlendShapes(torch.autograd.Function):
         width = 1 if start.is_cuda else _BLOCK
         n_items = -(-start.numel() // width)
         if n_items:
-            inputs = (width, dirs.reshape(len(dirs), -1), coeffs, start.reshape(-1))
+            inputs = (width, dirs.reshape(len(dirs), start.numel()), coeffs, start.reshape(-1))
             launch_ranges(_BLEND[start.dtype].blend, n_items, inputs, (out.view(-1),))
         return out
 
@@ -357,7 +358,7 @@ _F = wp.float64
 
 
 @wp.func
-def _sinc(x: _F):
+def _sinc(x: _F) -> _F:
     """``sin(x) / x``."""
     if wp.abs(x) < _F(1e-4):
         return _F(1.0) - x * x / _F(6.0)
@@ -365,13 +366,13 @@ def _sinc(x: _F):
 
 
 @wp.func
-def _skew(w: wp.vec3d):
+def _skew(w: wp.vec3d) -> wp.mat33d:
     zero = _F(0.0)
     return wp.mat33d(zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero)
 
 
 @wp.func
-def _rotation_less_identity(w: wp.vec3d):
+def _rotation_less_identity(w: wp.vec3d) -> wp.mat33d:
     """``R(w) - I = a K + b (w w^T - |w|^2 I)`` with ``a = sin t / t`` and ``b = (1 - cos t) / t^2`` (Rodrigues)."""
     angle = wp.length(w)
     half = _sinc(_F(0.5) * angle)
@@ -380,7 +381,7 @@ def _rotation_less_identity(w: wp.vec3d):
 
 
 @wp.func
-def _rotation_bwd(w: wp.vec3d, grad: wp.mat33d):
+def _rotation_bwd(w: wp.vec3d, grad: wp.mat33d) -> wp.vec3d:
     """Gradient of the rotation vector from that of its matrix.
 
     ``a' / t`` and ``b' / t`` lose their digits where their terms cancel, below an angle of 1: there they are series.
@@ -419,7 +420,7 @@ def _joints_kernel(
     feature: wp.array2d(dtype=_F),  # [J, 9], R - I of every joint
     rotations: wp.array(dtype=wp.mat33d),  # [J], of the joint in posed space
     posed: wp.array(dtype=wp.vec3d),  # [J], the joint in posed space
-):
+) -> None:
     zero = _F(0.0)
     for j in range(joints.shape[0]):
         less = _rotation_less_identity(poses[j])
@@ -455,7 +456,7 @@ def _joints_bwd_kernel(
     grad_poses: wp.array(dtype=wp.vec3d),  # [J]
     grad_rotations: wp.array(dtype=wp.mat33d),  # [J]
     grad_posed: wp.array(dtype=wp.vec3d),  # [J]
-):
+) -> None:
     n = joints.shape[0]
     for i in range(n):
         j = n - 1 - i  # children before parents

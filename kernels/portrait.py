@@ -67,9 +67,9 @@ def step_between(low: float, high: float, x: float):
 @wp.func
 def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32):
     """A random number of a lattice point, -1..1."""
-    h = x * wp.uint32(73856093) ^ y * wp.uint32(19349663) ^ z * wp.uint32(83492791) ^ seed * wp.uint32(2654435769)
-    h = (h ^ (h >> wp.uint32(15))) * wp.uint32(2246822519)
-    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(3266489917)
+    h = x * wp.uint32(73856093) ^ y * wp.uint32(19349663) ^ z * wp.uint32(83492791) ^ seed * wp.uint32(1640531527)
+    h = (h ^ (h >> wp.uint32(15))) * wp.uint32(2146121005)
+    h = (h ^ (h >> wp.uint32(13))) * wp.uint32(1183186591)
     return float((h ^ (h >> wp.uint32(16))) >> wp.uint32(8)) * (2.0 / 16777216.0) - 1.0
 
 

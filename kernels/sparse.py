@@ -5,6 +5,7 @@ not change. The matrix keeps its own transpose, so that the adjoint ``A^T g`` re
 addition, and the same bits from run to run and for any number of threads.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -64,7 +65,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         x: wp.array2d(dtype=scalar),
         channels: int,
         out: wp.array2d(dtype=scalar),
-    ): ...
+    ) -> None: ...
 
     @wp.kernel(module=f"{__name__}.{real.name}", enable_backward=False)
     def multiply_kernel(
@@ -76,7 +77,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         x: wp.array2d(dtype=scalar),  # [N, C]
         # Out:
         out: wp.array2d(dtype=scalar),  # [M, C]
-    ):
+    ) -> None:
         multiply_row(first + wp.tid(), starts, cols, values, x, x.shape[1], out)
 
     return SimpleNamespace(multiply=multiply_kernel)
@@ -229,5 +230,5 @@ def sparse_apply(matrix: SparseMatrix, x: Tensor) -> Tensor:
     if x.device != matrix.device:
         raise ValueError(f"a sparse matrix on {matrix.device} was applied to values on {x.device}")
     pick(_KERNELS, x=x)
-    out = _SparseApply.apply(matrix, x.reshape(len(x), x[0].numel() if len(x) else 1))
+    out = _SparseApply.apply(matrix, x.reshape(len(x), math.prod(x.shape[1:])))
     return out.reshape(matrix.shape[0], *x.shape[1:])

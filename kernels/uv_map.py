@@ -20,12 +20,12 @@ _EDGE = 1e-9  # a texel centre this close to an edge, as a barycentric weight, b
 
 
 @wp.func
-def _cross(a: wp.vec2d, b: wp.vec2d):
+def _cross(a: wp.vec2d, b: wp.vec2d) -> wp.float64:
     return a[0] * b[1] - a[1] * b[0]
 
 
 @wp.func
-def _barycentric(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d):
+def _barycentric(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d) -> wp.vec3d:
     """Weights of a, b and c at ``p``; all NaN for a face without area, whichever way it faces."""
     area = _cross(b - a, c - a)
     w_b = _cross(p - a, c - a) / area
@@ -34,7 +34,7 @@ def _barycentric(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d):
 
 
 @wp.func
-def _texel_range(low: wp.float64, high: wp.float64, size: int):
+def _texel_range(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
     """First and past-the-last texel whose centre may be between ``low`` and ``high`` [texels]; none if NaN."""
     end = wp.float64(size)
     if not (high >= wp.float64(0.0) and low <= end):
@@ -50,7 +50,7 @@ def _cover_kernel(
     height: int,
     # Out:
     face_ids: wp.array(dtype=int),  # [H W], the smallest face over each texel
-):
+) -> None:
     f = wp.tid()
     a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
     low, high = wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c))
@@ -72,7 +72,7 @@ def _weights_kernel(
     width: int,
     # Out:
     weights: wp.array(dtype=wp.vec3d),  # [E]
-):
+) -> None:
     e = wp.tid()
     f = face_ids[e]
     p = wp.vec2d(

@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from mgavatar.kernels.bridge import num_threads, set_num_threads
 from torch import Tensor
+
+from mgavatar.kernels.bridge import num_threads, set_num_threads
 
 OUTPUT_TOLERANCE = 1e-6
 """Largest error of a float32 output, over the largest absolute value of the twin's."""
@@ -34,7 +35,9 @@ def _copies(inputs: Sequence[Any], dtype: torch.dtype, device: torch.device | st
     return copies
 
 
-def _run(op: Callable[..., Any], inputs: Sequence[Any], cotangents: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+def _run(
+    op: Callable[..., Any], inputs: Sequence[Any], cotangents: Sequence[Tensor]
+) -> tuple[list[Tensor], list[Tensor]]:
     outputs = _outputs(op, inputs)
     leaves = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
     if leaves:
@@ -52,7 +55,7 @@ def assert_matches_twin(
     output_tolerance: float = OUTPUT_TOLERANCE,
     gradient_tolerance: float = GRADIENT_TOLERANCE,
 ) -> None:
-    """Check a kernel in float32 against its twin in float64: every output, and the gradient of every input that wants one.
+    """Check a kernel in float32 against its twin in float64: every output, every gradient that an input wants.
 
     The twin gets exactly the numbers that the kernel gets. Outputs must agree in largest absolute error over their
     scale, gradients in relative L2 error and, ten times more loosely, in largest absolute error over their scale.

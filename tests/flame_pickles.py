@@ -1,4 +1,4 @@
-"""Pickles like FLAME's, made without FLAME: stand-ins for chumpy's classes, and a pickler that writes as Python 2 did."""
+"""Pickles like FLAME's, made without FLAME: stand-ins for chumpy's classes, and a pickler that writes like Python 2."""
 
 from __future__ import annotations
 

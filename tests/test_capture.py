@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import torch
 from captures import write_capture, write_transforms
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from mgavatar.camera import look_at
@@ -236,6 +238,14 @@ def test_overlapping_splits(root):
     refusal(lambda: read_capture(root), "transforms_test.json", "transforms_train.json has already", "must not overlap")
 
 
+def test_cameras_that_cannot_be_told_apart(root):
+    for index in range(2):
+        edit_frame(root, index=index, camera_index=None)
+    refusal(
+        lambda: read_capture(root), "transforms_train.json: frame images/00000_01.png", "told apart by camera_index"
+    )
+
+
 def test_two_parameter_files_for_a_timestep(root):
     edit_frame(root, flame_param_path="flame_param/00003.npz")
     refusal(lambda: read_capture(root), "transforms_train.json: frame images/00000_01.png has 00003.npz")
@@ -398,6 +408,49 @@ def test_wrong_background_is_noticed(root, caplog):
         assert not caplog.text
         check_images(read_capture(root, background="black"))
     assert re.search(r"12 of 12 images are not on the stated background \(RGB 0, 0, 0\)", caplog.text)
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=9) | st.just("images/00000_02.png"),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
+    max_leaves=16,
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_json_value_anywhere_is_read_or_refused(fuzz_root, data):
+    """Whatever stands in a transforms file, the reader returns or says in one line which file is wrong."""
+    meta = json.loads((fuzz_root / "transforms_test_.json").read_text())
+    place = data.draw(st.sampled_from(["frame", "frame", "frame", "top", "file", "number"]))
+    frame = meta["frames"][1]
+    if place == "frame":
+        frame[data.draw(st.sampled_from(sorted(frame)))] = data.draw(VALUES)
+    elif place == "number":
+        frame["transform_matrix"][data.draw(st.integers(0, 3))][data.draw(st.integers(0, 3))] = data.draw(VALUES)
+    elif place == "top":
+        meta[data.draw(st.sampled_from(["frames", "w", "cx", "fl_x"]))] = data.draw(VALUES)
+    else:
+        meta = data.draw(VALUES)
+    (fuzz_root / "transforms_val.json").write_text(json.dumps(meta))
+    (fuzz_root / "transforms_train.json").write_text(json.dumps({"frames": frames_of(fuzz_root, "all")[:2]}))
+    try:
+        read_capture(fuzz_root)
+    except DataError as error:
+        message = str(error)
+    else:
+        message = ""
+    assert "\n" not in message
+    assert not message or "transforms_val.json" in message
+
+
+@pytest.fixture(scope="module")
+def fuzz_root(tmp_path_factory) -> Path:
+    """A capture whose train split has other timesteps than the file that is damaged, which stands for val."""
+    root = write_capture(tmp_path_factory.mktemp("fuzz") / "subject")
+    write_transforms(root, "all", frames_of(root, "train"))
+    (root / "transforms_test.json").rename(root / "transforms_test_.json")
+    return root
 
 
 def test_real_capture(real_data):

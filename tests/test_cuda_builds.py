@@ -3,9 +3,10 @@
 import importlib
 from pathlib import Path
 
-import mgavatar.kernels
 import pytest
 import warp as wp
+
+import mgavatar.kernels
 
 FOLDER = Path(mgavatar.kernels.__file__).parent
 FILES = sorted(path.stem for path in FOLDER.glob("*.py") if not path.stem.startswith("_"))

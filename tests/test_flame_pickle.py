@@ -211,6 +211,15 @@ def test_an_object_that_holds_itself(file):
         ("indices", np.array([0, 9], np.int32)),
         ("indptr", np.array([0, 5, 2], np.int32)),
         ("indptr", np.array([[0, 1, 2]], np.int32)),
+        ("indptr", np.array([0, 1, -9], np.int32)),
+        ("indptr", np.array([0, 1], np.int32)),
+        ("indptr", np.array([0, 1, 3], np.int32)),
+        ("indptr", np.array([1, 1, 2], np.int32)),
+        ("indptr", np.array([0, 1, 2**63], np.uint64)),
+        ("indices", np.array([0, -1], np.int32)),
+        ("indices", np.array([0, 2**63], np.uint64)),
+        ("indices", np.array([0], np.int32)),
+        ("_shape", (3, True)),
         ("_shape", (10**9, 10**9)),
         ("_shape", (-3, -2)),
         ("_shape", "square"),
@@ -277,8 +286,10 @@ def test_damaged_files_raise_data_errors_and_run_nothing(tmp_path, calls, data):
     try:
         arrays = read_flame_pickle(path)
     except DataError as error:
-        assert str(error).startswith(f"{path}: ")
-        assert "\n" not in str(error)
+        message = str(error)
     else:
+        message = f"{path}: "
         assert all(value.dtype.kind in "biuf" for value in arrays.values())
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
     assert not calls

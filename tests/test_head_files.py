@@ -75,7 +75,7 @@ def write_obj(path: Path, head: HeadModel, *, end: str = "\r\n") -> None:
 
 def flame_folder(folder: Path, *, name: str = "generic_model.pkl", protocol: int | str = "python2") -> Path:
     folder.mkdir(exist_ok=True)
-    (folder / name).write_bytes(dump(flame_content(FLAME_HEAD), protocol=protocol, old_modules=True))
+    (folder / name).write_bytes(dump(flame_content(FLAME_HEAD), protocol=protocol, old_modules=protocol == "python2"))
     return folder / name
 
 
@@ -127,6 +127,10 @@ def test_incomplete_head(tmp_path, key):
     [
         ({"v_template": HEAD.v_template[:, :2]}, "v_template has shape (42, 2), (n, 3) is needed"),
         ({"v_template": HEAD.v_template[:0]}, "v_template has shape (0, 3)"),
+        ({"v_template": 1.0}, "v_template has shape (), (n, 3) is needed"),
+        ({"shapedirs": 1.0}, "shapedirs has shape ()"),
+        ({"vt": 1.0}, "vt has shape ()"),
+        ({"mask_face": True}, "mask_face has shape ()"),
         ({"v_template": HEAD.v_template * 1000}, "v_template spans 346 units; vertices must be in metres"),
         ({"v_template": HEAD.v_template * 0}, "v_template spans 0 units"),
         ({"v_template": changed(HEAD.v_template, (3, 1), np.nan)}, "v_template holds 1 values that are NaN"),
@@ -138,7 +142,7 @@ def test_incomplete_head(tmp_path, key):
         ({"f": changed(HEAD.faces, (0, 0), -1)}, "f has index -1"),
         ({"f": changed(HEAD.faces.astype(np.uint64), (0, 0), 2**64 - 1)}, "f has index 18446744073709551615"),
         ({"f": changed(HEAD.faces, 0, 3)}, "f has faces that use a vertex twice"),
-        ({"n_expr": 4}, "shapedirs has shape (42, 3, 7), (42, 3, 8) is needed"),
+        ({"n_expr": 4, "expr_names": None}, "shapedirs has shape (42, 3, 7), (42, 3, 8) is needed"),
         ({"n_shape": -1}, "n_shape must be one number"),
         ({"n_shape": 4.0}, "n_shape must be one number"),
         ({"posedirs": HEAD.posedirs[..., :9]}, "posedirs has shape (42, 3, 9), (42, 3, 36) is needed"),
@@ -256,6 +260,8 @@ def test_pickle_of_another_model(tmp_path):
     path = tmp_path / "head.pkl"
     path.write_bytes(dump(flame_content(HEAD)))
     refusal(lambda: load_head_model(path), f"{path}: shapedirs has 7 directions, FLAME's pickles have 400")
+    path.write_bytes(dump({**flame_content(HEAD), "v_template": np.float64(1.0)}))
+    refusal(lambda: load_head_model(path), f"{path}: v_template has shape ()")
     path.write_bytes(dump({"f": np.arange(3)}))
     refusal(lambda: load_head_model(path), f"{path}: not a complete head model: v_template, shapedirs")
 
@@ -327,10 +333,12 @@ def test_damaged_npz_raises_data_errors(tmp_path, whole_file, data):
     try:
         head = load_head_model(path)
     except DataError as error:
-        assert str(error).startswith(f"{path}: ")
-        assert "\n" not in str(error)
+        message = str(error)
     else:
+        message = f"{path}: "
         assert_same(head, HEAD, but=("name", "masks", "expr_names", "expr_basis"))
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1,", '{"a": 1}}', "[" * 100_000, "9" * 5000, "\udcff"])
@@ -345,17 +353,17 @@ def test_a_write_is_whole_or_absent(tmp_path):
     path = tmp_path / "out.bin"
     with atomic_write(path) as file:
         file.write(b"one")
-    with pytest.raises(ZeroDivisionError), atomic_write(path) as file:
-        file.write(b"two")
-        raise ZeroDivisionError
+
+    def write(path: Path, *, divisor: int) -> None:
+        with atomic_write(path) as file:
+            file.write(b"two")
+            file.write(bytes(1 // divisor))
+
+    with pytest.raises(ZeroDivisionError):
+        write(path, divisor=0)
     assert path.read_bytes() == b"one"
     assert [entry.name for entry in tmp_path.iterdir()] == ["out.bin"]
-
-    def write() -> None:
-        with atomic_write(tmp_path / "nowhere/out.bin") as file:
-            file.write(b"three")
-
-    refusal(write, "nowhere/out.bin: cannot be written: No such file or directory")
+    refusal(lambda: write(tmp_path / "nowhere/out.bin", divisor=1), "nowhere/out.bin: cannot be written: No such file")
 
 
 def test_real_head(real_data):

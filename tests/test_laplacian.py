@@ -3,8 +3,9 @@
 import pytest
 import torch
 from checks import assert_gradcheck, assert_matches_twin, assert_same_bits
-from mgavatar.kernels.laplacian import laplacian, laplacian_matrix
 from twins import mesh as twins
+
+from mgavatar.kernels.laplacian import laplacian, laplacian_matrix
 
 SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
@@ -54,7 +55,9 @@ def test_float64_gradient_matches_finite_differences(rng):
 def test_same_bits_for_any_number_of_threads(device, rng):
     """Forward and adjoint do not depend on who adds what."""
     matrix = laplacian_matrix(grid(30), 900).to(device)
-    assert_same_bits(lambda x: laplacian(matrix, x), (torch.randn(900, 3, generator=rng).requires_grad_(),), device=device)
+    assert_same_bits(
+        lambda x: laplacian(matrix, x), (torch.randn(900, 3, generator=rng).requires_grad_(),), device=device
+    )
 
 
 def test_bad_faces_are_refused():

@@ -3,8 +3,9 @@
 import pytest
 import torch
 from checks import assert_gradcheck, assert_matches_twin, assert_same_bits
-from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from twins import mesh as twins
+
+from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 
 def entries(rng, n_rows, n_cols, count):
@@ -68,7 +69,9 @@ def test_empty_matrices():
     """No rows, no columns, no entries."""
     none = torch.zeros(0, dtype=torch.long)
     assert sparse_apply(SparseMatrix.from_coo(none, none, torch.zeros(0), (0, 4)), torch.ones(4, 3)).shape == (0, 3)
-    assert torch.equal(sparse_apply(SparseMatrix.from_coo(none, none, torch.zeros(0), (2, 0)), torch.ones(0, 3)), torch.zeros(2, 3))
+    assert torch.equal(
+        sparse_apply(SparseMatrix.from_coo(none, none, torch.zeros(0), (2, 0)), torch.ones(0, 3)), torch.zeros(2, 3)
+    )
 
 
 def test_numbers_that_are_not_finite_stay_in_their_rows():

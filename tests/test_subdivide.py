@@ -99,9 +99,9 @@ def test_twice_and_provenance(head):
 def test_flame_sized_head_takes_less_than_two_seconds():
     sphere = trimesh.creation.uv_sphere(radius=0.1, count=[71, 72])
     head = ball_head(sphere, n_shape=300, n_expr=100)
-    start = time.perf_counter()
+    start = time.process_time()  # not slowed by what else the machine does
     fine, _ = subdivide(head)
-    assert time.perf_counter() - start < 2.0
+    assert time.process_time() - start < 2.0
     assert len(fine.v_template) > 19_000
     assert fine.shapedirs.shape[2] == 400
 

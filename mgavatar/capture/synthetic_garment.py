@@ -67,7 +67,7 @@ def _torso(along: np.ndarray, angle: np.ndarray, rng: np.random.Generator) -> np
 
 def _clear_of_body(cloth: np.ndarray, head: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Push the cloth away from the axis to where the body ends, smoothly, then a little further."""
-    mesh = RayMesh(torch.from_numpy(head.astype(np.float32)), torch.from_numpy(np.ascontiguousarray(faces, np.int32)))
+    mesh = RayMesh(torch.from_numpy(head.astype(np.float32)), torch.from_numpy(np.array(faces, np.int32)))
     arm = cloth - np.array([0.0, 0.0, _AXIS_Z])
     arm[..., 1] = 0.0
     radius = np.linalg.norm(arm, axis=-1, keepdims=True)

@@ -182,4 +182,4 @@ def _view(camera: Camera, left: int, top: int, right: int) -> View:
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values, np.float32))
+    return torch.from_numpy(np.array(values, np.float32))

@@ -15,7 +15,7 @@ from mgavatar.head.model import HeadModel
 SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
 """Materials, numbered as in kernels/portrait.py."""
 
-_MIN_FACES = 40_000
+_MIN_FACES = 30_000
 """The head is subdivided until hair and silhouette have at least this many faces, at most twice."""
 
 

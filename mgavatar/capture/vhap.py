@@ -220,10 +220,12 @@ def _check_disjoint(entries: dict[Split, list[_Entry]], root: Path) -> None:
     for entry in (entry for split in SPLITS for entry in entries[split]):
         other = seen.setdefault((entry.timestep_id, entry.camera_id), entry)
         if other is not entry:
+            remedy = (
+                "splits must not overlap" if other.split != entry.split else "cameras are told apart by camera_index"
+            )
             raise DataError(
                 f"{root / f'transforms_{entry.split}.json'}: frame {entry.label} is timestep {entry.timestep_id} of "
-                f"camera {entry.camera_id}, which transforms_{other.split}.json has already ({other.label}); splits "
-                "must not overlap"
+                f"camera {entry.camera_id}, which transforms_{other.split}.json has already ({other.label}); {remedy}"
             )
 
 

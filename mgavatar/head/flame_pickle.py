@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
-import scipy.sparse
 
 from mgavatar.errors import DataError
 from mgavatar.files import GIBIBYTE, one_line, read_bytes
@@ -291,12 +290,19 @@ def _dense(fields: dict[str, Any], *, depth: int) -> np.ndarray:
     rows, columns = (int(_array(n, depth=depth + 1)) if isinstance(n, _Scalar) else n for n in shape)
     if not isinstance(rows, int) or not isinstance(columns, int) or not 0 <= rows * columns <= MAX_DENSE:
         raise ValueError("a sparse matrix of an unlikely shape")
-    parts = tuple(_array(fields[key], depth=depth + 1) for key in ("data", "indices", "indptr"))
-    if any(part.ndim != 1 for part in parts) or any(part.dtype.kind not in "iu" for part in parts[1:]):
+    data, indices, starts = (_array(fields[key], depth=depth + 1) for key in ("data", "indices", "indptr"))
+    if data.ndim != 1 or any(part.ndim != 1 or part.dtype.kind not in "iu" for part in (indices, starts)):
         raise ValueError("a sparse matrix whose parts are not lists")
-    matrix = scipy.sparse.csc_matrix(parts, shape=(rows, columns))
-    matrix.check_format(full_check=True)
-    return matrix.toarray()
+    # Checked here, because scipy's own check takes a negative end for an empty matrix and then reads out of bounds.
+    starts = starts.astype(np.int64)
+    if len(starts) != columns + 1 or starts[0] != 0 or np.any(np.diff(starts) < 0) or len(data) != len(indices):
+        raise ValueError("a sparse matrix whose columns do not follow one another")
+    count = int(starts[-1])
+    if count > len(data) or np.any(indices[:count] < 0) or np.any(indices[:count] >= rows):
+        raise ValueError("a sparse matrix with indices out of range")
+    dense = np.zeros((rows, columns), data.dtype)
+    np.add.at(dense, (indices[:count], np.repeat(np.arange(columns), np.diff(starts))), data[:count])
+    return dense
 
 
 def _selected(fields: dict[str, Any], *, depth: int) -> np.ndarray:

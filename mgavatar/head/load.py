@@ -91,7 +91,7 @@ def _from_npz(path: Path) -> HeadModel:
         )
     _require(arrays, (*RIG_KEYS, "n_shape", "n_expr"), path=path)
     n_shape, n_expr = (_count(arrays[key], where=f"{path}: {key}") for key in ("n_shape", "n_expr"))
-    n_verts = len(arrays["v_template"])
+    n_verts = len(_floats(arrays, "v_template", (None, 3), path=path))
     masks = {
         key.removeprefix("mask_"): _vertex_mask(value, n_verts, where=f"{path}: {key}")
         for key, value in arrays.items()
@@ -107,7 +107,8 @@ def _from_npz(path: Path) -> HeadModel:
 def _from_pickle(path: Path) -> HeadModel:
     arrays = read_flame_pickle(path, keys=RIG_KEYS)
     _require(arrays, RIG_KEYS, path=path)
-    n_dirs = arrays["shapedirs"].shape[-1]
+    n_verts = len(_floats(arrays, "v_template", (None, 3), path=path))
+    n_dirs = arrays["shapedirs"].shape[-1] if arrays["shapedirs"].ndim else 0
     if n_dirs <= FLAME_N_SHAPE:
         raise DataError(
             f"{path}: shapedirs has {n_dirs} directions, FLAME's pickles have 400 (300 identity, 100 expression); "
@@ -120,7 +121,7 @@ def _from_pickle(path: Path) -> HeadModel:
         path=path,
         n_shape=FLAME_N_SHAPE,
         n_expr=n_dirs - FLAME_N_SHAPE,
-        masks=_masks_beside(path, len(arrays["v_template"])),
+        masks=_masks_beside(path, n_verts),
         expr_basis=_basis_of_names(path.stem, path.absolute().parent.name),
         expr_names=(),
     )

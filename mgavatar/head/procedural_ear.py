@@ -37,7 +37,7 @@ def _ring(skin: Callable[[Array], Array], centre: Array, row: Array, t: Array) -
     c, s = np.cos(t), np.sin(t)
     behind = smoothstep(-0.75, 0.25, c)
     size = row[1] + (row[0] - row[1]) * behind
-    back, up = size * HALF_WIDTH * c * (1.0 + 0.16 * s), size * HALF_HEIGHT * s
+    back, up = size * HALF_WIDTH * c * (1.0 + 0.09 * s), size * HALF_HEIGHT * s
     back = back + LEAN * up - 0.0020 * (1.0 - size)
     up = up - 0.0050 * np.maximum(0.8 - size, 0.0)
     foot = skin(centre + np.stack([back, up], axis=1))
@@ -67,7 +67,7 @@ def ear_rings(
     # On the sheet p grows to the back of the left half: counter-clockwise from outside is up, then forwards.
     t = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
     scale = np.linspace(1.0, 0.12, len(RINGS))
-    sheet = [centre + s * np.stack([RINGS[0, 0] * HALF_WIDTH * np.cos(t) * (1 + 0.16 * np.sin(t)) + LEAN * RINGS[0, 0] * HALF_HEIGHT * np.sin(t),
+    sheet = [centre + s * np.stack([RINGS[0, 0] * HALF_WIDTH * np.cos(t) * (1 + 0.09 * np.sin(t)) + LEAN * RINGS[0, 0] * HALF_HEIGHT * np.sin(t),
                                     RINGS[0, 0] * HALF_HEIGHT * np.sin(t)], axis=1) for s in scale]  # fmt: skip
     verts = [_ring(skin, centre, row, t) for row in RINGS]
     middle = skin(centre[None] + [[0.0008, -0.002]]) - [0.0025, 0.0, 0.0]

@@ -30,7 +30,7 @@ class Pull(NamedTuple):
 
 # Left halves of mirrored pairs: name_L is as written, name_R its mirror image.
 PAIRS: tuple[tuple[str, tuple[Pull, ...]], ...] = (
-    ("smile", (Pull((25, -46), (13, 12), (5.5, 6.5, -4)), Pull((36, -14), (15, 13), (1, 3, 2.5)), Pull((10, -47), (9, 10), (1, 0.5, -1)))),
+    ("smile", (Pull((25, -46), (15, 13), (5.5, 6.5, -4)), Pull((36, -14), (15, 13), (1, 3, 2.5)), Pull((10, -47), (9, 10), (1, 0.5, -1)))),
     ("frown", (Pull((25, -49), (12, 11), (0.5, -7, -1)), Pull((18, -64), (12, 10), (0, -2, 0.5)))),
     ("upper_lip_raise", (Pull((11, -40), (10, 9), (0, 5.5, 1), "upper"), Pull((16, -22), (9, 9), (0, 2, 0.8)))),
     ("lower_lip_depress", (Pull((11, -55), (10, 9), (0, -5.5, 0.5), "lower"),)),
@@ -137,7 +137,7 @@ def lid_direction(mesh: HeadMesh, *, upper: float, lower: float) -> Array:
     opposite = at[(n - np.arange(n)) % n, 1]  # the ring is sampled evenly: the mirrored index is above or below
     is_upper = np.arange(n) <= n // 2
     low, high = np.minimum(at[:, 1], opposite), np.maximum(at[:, 1], opposite)
-    meet = low + 0.30 * (high - low) + np.where(is_upper, 0.0002, -0.0002) * (high - low > 1e-5)
+    meet = low + 0.30 * (high - low) + np.where(is_upper, 0.00006, -0.00006) * (high - low > 1e-5)
     radius = np.hypot(at[:, 1], at[:, 2])
     turn = np.arcsin(np.clip(meet / radius, -1, 1)) - np.arctan2(at[:, 1], at[:, 2])
     turn *= np.where(is_upper, upper, lower)

@@ -24,6 +24,8 @@ AROUND = 0.070
 P_BACK = np.pi * AROUND
 N_LID, N_LIP, N_EAR = 30, 21, 28
 GUTTER = 0.006
+RED_RINGS = (1.0, 0.74, 0.48, 0.24, 0.07, 0.0)
+"""Where the rings of the red of the lips lie between its border and the opening."""
 
 Array = np.ndarray
 
@@ -60,10 +62,10 @@ def spacing(points: Array) -> Array:
     """Wanted distance between neighbours [m] at points of the featureless head."""
     x, y, z = np.abs(points[..., 0]), points[..., 1], points[..., 2]
     face = np.hypot(np.hypot(x / 1.0, (y + 0.018) / 1.25), np.minimum(z - 0.035, 0.0) / 0.9)
-    coarse = 0.0040 + 0.0062 * form.smoothstep(0.035, 0.115, face)
-    nose = np.exp(-((x / 0.016) ** 2) - ((y + 0.015) / 0.020) ** 2)
+    coarse = 0.0039 + 0.0064 * form.smoothstep(0.035, 0.115, face)
+    nose = np.exp(-((x / 0.016) ** 2) - ((y + 0.013) / 0.021) ** 2)
     chin = np.exp(-((x / 0.040) ** 2) - ((y + 0.092) / 0.014) ** 2) * (z > 0.0)
-    return coarse * (1.0 - 0.42 * nose - 0.25 * chin)
+    return coarse * (1.0 - 0.55 * nose - 0.25 * chin)
 
 
 @dataclass
@@ -155,15 +157,30 @@ def _lid_rings() -> list[Array]:
     return [edge + f * (outer - edge) for f in (1.0, 0.74, 0.50, 0.29, 0.12, 0.0)]
 
 
+def _lip_border(t: Array) -> Array:
+    """The edge of the lips' red on the sheet: a half ring at the angles ``t``."""
+    x = (form.MOUTH_HALF_WIDTH + 0.0024) * np.cos(t)
+    red = form.lip_height(np.minimum(x, form.MOUTH_HALF_WIDTH + 0.0014), upper=np.sin(t) > 0)
+    opening = form.mouth_opening(x)
+    distance = red + opening
+    for _ in range(20):  # the fixed point of the squeeze that closes the sheet's mouth
+        distance = red + opening * (1.0 - form.smoothstep(opening, form.MOUTH_BLEND, distance))
+    distance *= np.abs(np.sin(t)) > 1e-9
+    return np.stack([x, form.MOUTH_Y + np.sign(np.sin(t)) * distance], axis=1)
+
+
 def _lip_rings() -> list[Array]:
-    """Half rings around the mouth on the sheet, counter-clockwise, from the cheek to the opening."""
+    """Half rings around the mouth on the sheet, counter-clockwise, from the cheek over the border to the opening."""
     t = np.linspace(-np.pi / 2, np.pi / 2, N_LIP)
+    t[N_LIP // 2] = 0.0
     c, s = np.cos(t), np.sin(t)
     c[[0, -1]] = 0.0
     x = form.MOUTH_HALF_WIDTH * c
     hole = np.stack([x, form.MOUTH_Y + np.sign(s) * form.mouth_opening(x)], axis=1)
-    outer = np.stack([0.0385 * c, form.MOUTH_Y - 0.0005 + 0.0215 * s], axis=1)
-    return [hole + f * (outer - hole) for f in (1.0, 0.76, 0.55, 0.38, 0.24, 0.12, 0.04, 0.0)]
+    outer = np.stack([0.0365 * c, form.MOUTH_Y - 0.0010 + 0.0180 * s], axis=1)
+    border = _lip_border(t)
+    around = [border + f * (outer - border) for f in (1.0, 0.62, 0.28)]
+    return around + [hole + f * (border - hole) for f in RED_RINGS]
 
 
 def _line(start: Array, end: Array) -> Array:
@@ -183,6 +200,13 @@ def _inside(points: Array, polygon: Array) -> Array:
     crosses = (a[:, 1] > y) != (b[:, 1] > y)
     rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
     return (crosses & (x < a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0]))).sum(axis=1) % 2 == 1
+
+
+def _encroaches(points: Array, polygon: Array) -> Array:
+    """Whether points are so close to an edge of a polygon that Delaunay triangles would break it."""
+    a, b = polygon, np.roll(polygon, -1, axis=0)
+    distance = np.linalg.norm(points[:, None] - (a + b) / 2, axis=-1)
+    return np.any(distance < 0.55 * np.linalg.norm(b - a, axis=1) * (np.linalg.norm(b - a, axis=1) < 0.012), axis=1)
 
 
 def _scatter(candidates: Array, wanted: Array, fixed: Array) -> Array:
@@ -210,7 +234,7 @@ def _fill(fixed: Array, holes: list[Array], candidates: Array, embed: Callable[[
         All points, the fixed ones first, [P, 2]; counter-clockwise triangles, [F, 3].
     """
     def in_hole(at: Array) -> Array:
-        return np.any([np.zeros(len(at), bool), *(_inside(at, hole) for hole in holes)], axis=0)
+        return np.any([np.zeros(len(at), bool), *(_inside(at, hole) | _encroaches(at, hole) for hole in holes)], axis=0)
 
     candidates = candidates[~in_hole(candidates)]
     points = np.concatenate([fixed, _scatter(candidates, spacing(embed(candidates)), fixed)])
@@ -222,7 +246,8 @@ def _fill(fixed: Array, holes: list[Array], candidates: Array, embed: Callable[[
         free = ~near & ~in_hole(moved) & (np.arange(len(points)) >= n)
         points[free] = moved[free]
     triangles = Delaunay(points).simplices
-    triangles = triangles[~in_hole(points[triangles].mean(axis=1))]
+    centres = points[triangles].mean(axis=1)
+    triangles = triangles[~np.any([np.zeros(len(centres), bool), *(_inside(centres, hole) for hole in holes)], axis=0)]
     ab, ac = points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     triangles[area < 0] = triangles[area < 0][:, ::-1]

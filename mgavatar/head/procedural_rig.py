@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from mgavatar.head import procedural_surface as form
-from mgavatar.head.procedural_mesh import HeadMesh
+from mgavatar.head.procedural_mesh import RED_RINGS, HeadMesh
 from mgavatar.head.procedural_surface import smoothstep
 
 Array = np.ndarray
@@ -79,14 +79,22 @@ def skinning_weights(mesh: HeadMesh, jaw: Array) -> Array:
 
 
 def _regress(verts: Array, joint: Array, support: Array, reach: float) -> Array:
-    """Weights of ``support`` that sum to 1, reproduce ``joint`` and stay close to a bell around it."""
-    points = verts[support]
-    bell = np.exp(-0.5 * np.sum((points - joint) ** 2, axis=1) / reach**2)
-    bell /= bell.sum()
-    rows = np.concatenate([np.ones((1, len(points))), (points - joint).T])
-    lacking = np.array([1.0, 0.0, 0.0, 0.0]) - rows @ bell
+    """Positive weights of ``support`` that sum to 1 and reproduce ``joint``: a bell around it, tilted exponentially.
+
+    The tilt is the root of a convex problem, found by Newton's method.
+    """
+    offset = (verts[support] - joint) / reach
+    bell = -0.5 * np.sum(offset**2, axis=1)
+    tilt = np.zeros(3)
+    for _ in range(30):
+        logit = bell + offset @ tilt
+        weight = np.exp(logit - logit.max())
+        weight /= weight.sum()
+        mean = weight @ offset
+        step = np.linalg.solve((offset * weight[:, None]).T @ offset - np.outer(mean, mean), mean)
+        tilt -= step / max(1.0, np.linalg.norm(step))
     row = np.zeros(len(verts))
-    row[support] = bell * (1.0 + rows.T @ np.linalg.solve((rows * bell) @ rows.T, lacking))
+    row[support] = weight
     return row
 
 
@@ -100,7 +108,7 @@ def joint_regressor(mesh: HeadMesh) -> Array:
     supports = [skin & (np.abs(y - JOINTS_AT[j, 1]) < 0.022) for j in (0, 1)] + [sides]
     eye = mesh.part == "eye"
     supports += [eye & (mesh.verts[:, 0] > 0), eye & (mesh.verts[:, 0] < 0)]
-    reaches = (0.05, 0.05, 0.05, 1.0, 1.0)
+    reaches = (0.05, 0.05, 0.05, 0.05, 0.05)
     each = zip(JOINTS_AT, supports, reaches, strict=True)
     return np.stack([_regress(mesh.verts, joint, np.flatnonzero(s), reach) for joint, s, reach in each])
 
@@ -157,9 +165,7 @@ def regions(mesh: HeadMesh) -> dict[str, Array]:
         boundary |= neighbours @ boundary.astype(float) > 0
     front = (z > -0.018 + 0.10 * np.clip(-0.05 - y, 0.0, 0.02)) & (y < 0.082) & (mesh.level < 12.6)
     lips = np.zeros(len(verts), bool)
-    upper = y > form.MOUTH_Y
-    from_line = np.abs(verts[:, 1] - form.MOUTH_Y)
-    lips[skin & (x < form.MOUTH_HALF_WIDTH + 0.001) & (z > 0) & (from_line < 1.08 * form.lip_height(x, upper=upper) + 1e-4)] = True
+    lips[np.concatenate([both_sides(mesh, f"lip_{k}") for k in range(len(RED_RINGS))])] = True
     shoulders = skin & (mesh.level > 15.6)
     eye = part == "eye"
     masks = {

@@ -74,7 +74,9 @@ def face_frames(verts: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([edge, normal, third], 2), scales, (a + b + c) / 3
 
 
-def to_world(q: Tensor, k: Tensor, t: Tensor, means: Tensor, quats: Tensor, scales: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def to_world(
+    q: Tensor, k: Tensor, t: Tensor, means: Tensor, quats: Tensor, scales: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """``k R mu + T``, the product of the quaternions as a matrix times a vector, and ``k s``."""
     w, x, y, z = q.unbind(1)
     left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w], 1).reshape(-1, 4, 4)

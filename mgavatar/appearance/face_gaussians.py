@@ -1,0 +1,106 @@
+"""Face-bound Gaussians: local parameters, and their way to the world (Section 3.2, Eq. 8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from mgavatar.config import AppearanceConfig
+from mgavatar.kernels.binding import face_frames, to_world
+
+PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
+"""Learnable rows of a Gaussian; ``face_ids`` goes along with them."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaceFrames:
+    """R, k and T of every face of a posed mesh (Eq. 8).
+
+    Attributes:
+        quats: Rotations wxyz, shape [F, 4].
+        scales: Sizes k [m], shape [F].
+        centers: Centroids T [m], shape [F, 3].
+    """
+
+    quats: Tensor
+    scales: Tensor
+    centers: Tensor
+
+    @staticmethod
+    def of(verts: Tensor, faces: Tensor) -> FaceFrames:
+        """Frames of a mesh; the mesh is frozen here, so without gradients."""
+        with torch.no_grad():
+            return FaceFrames(*face_frames(verts, faces))
+
+    def at(self, face_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Frames of chosen faces."""
+        return self.quats[face_ids], self.scales[face_ids], self.centers[face_ids]
+
+
+class FaceGaussians(nn.Module):
+    """One Gaussian a face at first, at its centre; density control adds and removes others."""
+
+    def __init__(self, n_faces: int, config: AppearanceConfig, device: torch.device) -> None:
+        super().__init__()
+        self.n_faces = n_faces
+        along, across = config.initial_scale, config.initial_thickness
+        scales = torch.tensor([along, across, along], device=device)  # edge, normal, their cross product
+        quats = torch.zeros(n_faces, 4, device=device)
+        quats[:, 0] = 1.0
+        logit = torch.logit(torch.tensor(config.initial_opacity)).item()
+        self.local_means = nn.Parameter(torch.zeros(n_faces, 3, device=device))
+        self.quats = nn.Parameter(quats)
+        self.log_scales = nn.Parameter(scales.log().repeat(n_faces, 1))
+        self.opacity_logits = nn.Parameter(torch.full((n_faces,), logit, device=device))
+        self.face_ids: Tensor
+        self.uvs: Tensor
+        self.register_buffer("face_ids", torch.arange(n_faces, device=device))
+        self.register_buffer("uvs", torch.zeros(n_faces, 2, device=device))
+
+    def __len__(self) -> int:
+        return len(self.face_ids)
+
+    def canonical_means(self, frames: FaceFrames) -> Tensor:
+        """``mu_c`` of Eq. 9: centres on the canonical mesh [m], shape [N, 3]. No gradient: the encoding stays put."""
+        with torch.no_grad():
+            ones = torch.ones_like(self.local_means)
+            return to_world(*frames.at(self.face_ids), self.local_means, self.quats, ones)[0]
+
+    def resize(self, n: int) -> None:
+        """Make room for ``n`` Gaussians, before a state of that many is loaded."""
+        for name in PARAMETERS:
+            old = getattr(self, name)
+            setattr(self, name, nn.Parameter(old.new_zeros(n, *old.shape[1:])))
+        self.face_ids = self.face_ids.new_zeros(n)
+        self.uvs = self.uvs.new_zeros(n, 2)
+
+
+def face_uvs(local_means: Tensor, face_ids: Tensor, frames: FaceFrames, verts: Tensor, faces: Tensor, face_vt: Tensor) -> Tensor:
+    """Texture coordinate under each Gaussian: its centre dropped onto its face along the normal, kept inside it.
+
+    Args:
+        local_means: In units of k, shape [N, 3].
+        face_ids: Shape [N].
+        frames: Frames of the canonical mesh.
+        verts: Canonical vertices [m], shape [V, 3].
+        faces: Shape [F, 3].
+        face_vt: Texture coordinates of the faces' corners, shape [F, 3, 2].
+
+    Returns:
+        Shape [N, 2].
+    """
+    with torch.no_grad():
+        ones = torch.ones_like(local_means)
+        points = to_world(*frames.at(face_ids), local_means, frames.quats[face_ids], ones)[0]
+        a, b, c = verts[faces.long()[face_ids]].unbind(1)
+        e1, e2, d = b - a, c - a, points - a
+        d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
+        p1, p2 = (d * e1).sum(1), (d * e2).sum(1)
+        det = (d11 * d22 - d12 * d12).clamp(min=1e-20)
+        v = (d22 * p1 - d12 * p2) / det
+        w = (d11 * p2 - d12 * p1) / det
+        weights = torch.stack([1 - v - w, v, w], 1).clamp(min=0.0)
+        weights = weights / weights.sum(1, keepdim=True)
+        return (weights[:, :, None] * face_vt[face_ids]).sum(1)

@@ -1,0 +1,174 @@
+"""The appearance on a frozen head: from a pose and a camera to Gaussians in the world (Section 3.2)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from mgavatar.appearance.color_net import ColorNet
+from mgavatar.appearance.face_gaussians import FaceFrames, FaceGaussians, face_uvs
+from mgavatar.appearance.offset_net import OffsetNet, Offsets
+from mgavatar.camera import Camera
+from mgavatar.config import FitConfig
+from mgavatar.gaussians import Gaussians
+from mgavatar.geometry.head import PersonalHead
+from mgavatar.head.body import Pose
+from mgavatar.kernels.binding import to_world
+from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
+from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
+
+_CACHED_POSES = 256
+
+
+@dataclass(frozen=True, eq=False)
+class PosedMesh:
+    """A frozen head in one pose.
+
+    Attributes:
+        verts: In world space [m], shape [V, 3].
+        frames: Face frames of ``verts``.
+        pose_map: ``M_pose``, positions without root motion in units of the head's size, shape [3, H, W], or empty.
+        theta: Rotation vectors of the five joints [rad], shape [15].
+    """
+
+    verts: Tensor
+    frames: FaceFrames
+    pose_map: Tensor
+    theta: Tensor
+
+
+class FrozenHead:
+    """The result of the geometry stage; nothing in it learns any more."""
+
+    def __init__(self, head: PersonalHead, *, uv_resolution: int | None) -> None:
+        """Freeze ``head``; ``uv_resolution`` is the size of the position maps, or None without them."""
+        self.head = head
+        self.body = head.body
+        fine = self.body.fine
+        device = self.body.device
+        for parameter in head.parameters():
+            parameter.requires_grad_(False)
+        with torch.no_grad():
+            self.canonical = head.canonical()
+        self.frames = FaceFrames.of(self.canonical, self.body.faces)
+        low, high = self.canonical.min(0).values, self.canonical.max(0).values
+        self.low, self.high = low, high
+        self.extent = float((high - low).norm())
+        """Diagonal of the canonical head [m]: the yardstick of density control."""
+        vt, ft = torch.tensor(fine.vt, device=device), torch.tensor(fine.ft, dtype=torch.int32, device=device)
+        self.face_vt = vt[ft.long()]
+        self._uv = None
+        self.canonical_map = torch.zeros(3, 0, 0, device=device)
+        if uv_resolution is not None:
+            self._uv = uv_map(vt, ft, self.body.faces, self.body.n_verts, uv_resolution, uv_resolution)
+            self.canonical_map = self._map(self.canonical)
+        self._posed: OrderedDict[int, PosedMesh] = OrderedDict()
+
+    def _map(self, verts: Tensor) -> Tensor:
+        if self._uv is None:
+            return self.canonical_map
+        center, half = (self.low + self.high) / 2, (self.high - self.low).max() / 2
+        return position_map(self._uv, (verts - center) / half)
+
+    def posed(self, pose: Pose) -> PosedMesh:
+        """The head in any pose."""
+        with torch.no_grad():
+            verts = self.head.posed(pose).verts
+            still = self.head.posed(pose.centered()).verts if self._uv is not None else verts
+            theta = pose.joint_rotations().reshape(-1)
+            return PosedMesh(verts, FaceFrames.of(verts, self.body.faces), self._map(still), theta)
+
+    def at_timestep(self, timestep: int) -> PosedMesh:
+        """The head at a timestep of its capture; the most recently used ones are kept."""
+        if timestep not in self._posed:
+            if len(self._posed) >= _CACHED_POSES:
+                self._posed.popitem(last=False)
+            self._posed[timestep] = self.posed(self.head.pose(timestep))
+        self._posed.move_to_end(timestep)
+        return self._posed[timestep]
+
+
+class Appearance(nn.Module):
+    """Face-bound Gaussians with ColorNet and OffsetNet."""
+
+    def __init__(self, frozen: FrozenHead, config: FitConfig, *, seed: int) -> None:
+        super().__init__()
+        a = config.appearance
+        self.frozen = frozen
+        self.config = config
+        device = frozen.canonical.device
+        self.gaussians = FaceGaussians(len(frozen.body.faces), a, device)
+        margin = 0.05 * (frozen.high - frozen.low)
+        self.color_net = ColorNet(frozen.low - margin, frozen.high + margin, a.color_net, seed=seed).to(device)
+        self.offset_net = OffsetNet(a.offset_net).to(device) if a.offset_net.enabled else None
+        self._sampler: SparseMatrix | None = None
+
+        self.rebind()
+
+    def rebind(self) -> None:
+        """Look up the Gaussians' texture coordinates anew; call it when their number has changed."""
+        g, frozen = self.gaussians, self.frozen
+        means = g.local_means.detach()
+        g.uvs = face_uvs(means, g.face_ids, frozen.frames, frozen.canonical, frozen.body.faces, frozen.face_vt)
+        self._sampler = None
+
+    def resize(self, n: int) -> None:
+        """Make room for ``n`` Gaussians, before a state of that many is loaded."""
+        self.gaussians.resize(n)
+        self._sampler = None
+
+    def _offsets(self, posed: PosedMesh) -> tuple[Tensor, Offsets] | None:
+        if self.offset_net is None:
+            return None
+        maps = self.offset_net(self.frozen.canonical_map, posed.pose_map, posed.theta)
+        if self._sampler is None:
+            self._sampler = uv_sampler(self.gaussians.uvs, *maps.shape[1:])
+        return maps, Offsets.of(sparse_apply(self._sampler, maps.reshape(len(maps), -1).T.contiguous()))
+
+    def _directions(self, means: Tensor, posed: PosedMesh, camera: Camera) -> Tensor:
+        """Unit view directions of Eq. 9, in the frame that ``color_net.view_frame`` names."""
+        position = torch.tensor(camera.position, dtype=torch.float32, device=means.device)
+        directions = torch.nn.functional.normalize(means.detach() - position, dim=1)
+        if self.config.appearance.color_net.view_frame == "world":
+            return directions
+        face_ids = self.gaussians.face_ids
+        back = _rotate(posed.frames.quats[face_ids] * _CONJUGATE.to(means.device), directions)
+        return _rotate(self.frozen.frames.quats[face_ids], back)
+
+    def forward(self, posed: PosedMesh, camera: Camera) -> tuple[Gaussians, Tensor | None]:
+        """Gaussians of one view.
+
+        Returns:
+            The Gaussians ``G_r`` of Section 3.2, and ``O_map`` [13, H, W] for its regulariser, or None without it.
+        """
+        g = self.gaussians
+        means, quats, log_scales, logits = g.local_means, g.quats, g.log_scales, g.opacity_logits
+        offsets = self._offsets(posed)
+        if offsets is not None:
+            delta = offsets[1]
+            half = torch.cat([torch.ones_like(delta.rotations[:, :1]), 0.5 * delta.rotations], 1)
+            means, quats = means + delta.means, _product(quats, half)
+            log_scales, logits = log_scales + delta.log_scales, logits + delta.opacity_logits
+        means, quats, scales = to_world(*posed.frames.at(g.face_ids), means, quats, log_scales.exp())
+        colors = self.color_net(g.canonical_means(self.frozen.frames), self._directions(means, posed, camera))
+        if offsets is not None:
+            colors = colors + offsets[1].colors
+        return Gaussians(means, quats, scales, torch.sigmoid(logits), colors), offsets[0] if offsets else None
+
+
+_CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
+
+
+def _product(p: Tensor, q: Tensor) -> Tensor:
+    """Hamilton product of quaternions wxyz, shapes [N, 4]."""
+    pw, pv, qw, qv = p[:, :1], p[:, 1:], q[:, :1], q[:, 1:]
+    return torch.cat([pw * qw - (pv * qv).sum(1, keepdim=True), pw * qv + qw * pv + torch.cross(pv, qv, dim=1)], 1)
+
+
+def _rotate(q: Tensor, v: Tensor) -> Tensor:
+    """Vectors [N, 3] turned by unit quaternions wxyz [N, 4]."""
+    t = 2.0 * torch.cross(q[:, 1:], v, dim=1)
+    return v + q[:, :1] * t + torch.cross(q[:, 1:], t, dim=1)

@@ -1,0 +1,297 @@
+"""Synthetic captures: layout, truth, and what makes them hard to cheat on."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mgavatar.capture.synthetic import make_synthetic_capture
+from mgavatar.capture.synthetic_image import Studio, front_camera, frontal_arc, held_out_camera, make_look
+from mgavatar.capture.synthetic_motion import action_columns, perform
+from mgavatar.capture.synthetic_person import Person, Pose, make_person, subdivision, vertex_normals
+from mgavatar.errors import DataError
+from mgavatar.head.model import HeadModel
+from mgavatar.head.procedural import build_head
+from PIL import Image
+
+SIZE = (48, 40)
+KEYS = {"shape", "expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation"}
+
+
+@pytest.fixture(scope="module")
+def head() -> HeadModel:
+    return build_head()
+
+
+@pytest.fixture(scope="module")
+def capture(head: HeadModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four cameras, three timesteps."""
+    out = tmp_path_factory.mktemp("synthetic") / "person"
+    calls: list[tuple[int, int]] = []
+    made = make_synthetic_capture(
+        out, cameras=4, timesteps=3, size=SIZE, seed=3, head=head, progress=lambda *done: calls.append(done)
+    )
+    assert made == out
+    assert calls == [(i + 1, 12) for i in range(12)]
+    return out
+
+
+@pytest.fixture(scope="module")
+def person(head: HeadModel) -> Person:
+    return make_person(head, np.random.default_rng(3))
+
+
+def meta(root: Path, split: str) -> dict:
+    return json.loads((root / f"transforms{split}.json").read_text("utf-8"))
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path, allow_pickle=False) as file:
+        return dict(file)
+
+
+def every_byte(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+def test_layout_is_complete(capture: Path) -> None:
+    """Every file of the VHAP layout is there, and nothing else, not even a leftover of writing."""
+    names = {f"{t:05d}_{c:02d}.png" for t in range(3) for c in range(4)}
+    assert {p.name for p in (capture / "images").iterdir()} == names
+    assert {p.name for p in (capture / "fg_masks").iterdir()} == names
+    assert {p.name for p in (capture / "flame_param").iterdir()} == {f"{t:05d}.npz" for t in range(3)}
+    rest = {p.name for p in capture.iterdir()} - {"images", "fg_masks", "flame_param", "ground_truth"}
+    assert rest == {"canonical_flame_param.npz", *(f"transforms{s}.json" for s in ("", "_train", "_val", "_test"))}
+    assert [p.name for p in capture.parent.iterdir()] == [capture.name]
+
+
+def test_frames_name_existing_files_and_hold_the_fields_keys(capture: Path) -> None:
+    every = meta(capture, "")
+    assert (every["w"], every["h"]) == SIZE
+    assert every["timestep_indices"] == [0, 1, 2]
+    assert every["camera_indices"] == [0, 1, 2, 3]
+    for frame in every["frames"]:
+        for key in ("file_path", "fg_mask_path", "flame_param_path"):
+            assert (capture / frame[key]).is_file()
+        assert frame["camera_angle_x"] == pytest.approx(2 * np.arctan(frame["w"] / (2 * frame["fl_x"])))
+        rotation = np.array(frame["transform_matrix"])[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert rotation[1, 1] > 0.9  # OpenGL: the camera's y points up
+
+
+def test_splits_are_disjoint_and_mean_what_they_say(capture: Path) -> None:
+    members = {s: {(f["timestep_index"], f["camera_index"]) for f in meta(capture, s)["frames"]} for s in ("_train", "_val", "_test")}
+    train, val, test = members.values()
+    assert train | val | test == {(t, c) for t in range(3) for c in range(4)}
+    assert len(train) + len(val) + len(test) == 12
+    assert val == {(t, held_out_camera(4)) for t in range(2)}
+    assert test == {(2, c) for c in range(4)}
+
+
+def test_parameters_have_vhap_sizes_and_hide_the_identity(capture: Path, head: HeadModel) -> None:
+    for path in (*sorted((capture / "flame_param").iterdir()), capture / "canonical_flame_param.npz"):
+        values = arrays(path)
+        assert set(values) == KEYS
+        assert values["shape"].shape == (300,)
+        assert not values["shape"].any()
+        assert values["expr"].shape == (1, max(100, head.n_expr))
+        assert all(values[key].shape == (1, 3) for key in ("rotation", "neck_pose", "jaw_pose", "translation"))
+        assert values["eyes_pose"].shape == (1, 6)
+    canonical = arrays(capture / "canonical_flame_param.npz")
+    assert canonical["jaw_pose"].dtype == np.float64
+    assert canonical["jaw_pose"].tolist() == [[0.3, 0.0, 0.0]]
+    assert np.abs(arrays(capture / "ground_truth/truth.npz")["true_shape"]).max() > 0.5
+
+
+def test_tracked_motion_is_a_little_wrong(capture: Path) -> None:
+    """Jitter of 0.3 degrees, 0.5 mm and 0.03: there, but small."""
+    truth = arrays(capture / "ground_truth/truth.npz")
+    files = [arrays(p) for p in sorted((capture / "flame_param").iterdir())]
+    for key, deviation in (("rotation", 0.0052), ("neck_pose", 0.0052), ("eyes_pose", 0.0052), ("translation", 5e-4)):
+        error = np.concatenate([f[key] for f in files]) - truth[f"true_{key}"]
+        assert 0.3 * deviation < error.std() < 2.0 * deviation, key
+        assert np.abs(error).max() < 4.5 * deviation, key
+    used = truth["true_expr"].any(0)
+    error = np.concatenate([f["expr"] for f in files])[:, : len(used)] - truth["true_expr"]
+    assert 0.01 < error[:, used].std() < 0.06
+    assert not error[:, ~used].any()
+
+
+def test_truth_lies_inside_the_masks(capture: Path) -> None:
+    """Vertices of every timestep, projected with the written cameras, fall on the written masks."""
+    truth = arrays(capture / "ground_truth/truth.npz")
+    assert truth["vertices"].shape[0] == 3
+    assert truth["vertices"].dtype == np.float32
+    assert truth["faces"].max() == truth["vertices"].shape[1] - 1
+    for frame in meta(capture, "")["frames"]:
+        to_world = np.array(frame["transform_matrix"])
+        to_world[:3, 1:3] *= -1
+        local = (truth["vertices"][frame["timestep_index"]] - to_world[:3, 3]) @ to_world[:3, :3]
+        x = frame["fl_x"] * local[:, 0] / local[:, 2] + frame["cx"]
+        y = frame["fl_y"] * local[:, 1] / local[:, 2] + frame["cy"]
+        inside = (x > 0) & (x < frame["w"]) & (y > 0) & (y < frame["h"])
+        mask = pixels(capture / frame["fg_mask_path"])
+        assert inside.mean() > 0.4
+        assert (mask[y[inside].astype(int), x[inside].astype(int)] > 0).mean() > 0.98
+
+
+def test_seen_counts_training_images(capture: Path) -> None:
+    truth = arrays(capture / "ground_truth/truth.npz")
+    assert truth["seen"].max() <= 6  # 2 timesteps x 3 cameras
+    assert truth["seen"].max() >= 5
+    assert (truth["seen"][truth["mask_teeth"]] == 0).mean() > 0.5
+    assert 0.02 < (truth["seen"][truth["mask_face"]] > 0).mean() <= 1.0
+
+
+def test_images_are_white_outside_and_antialiased_at_the_edge(capture: Path) -> None:
+    for path in (capture / "images").iterdir():
+        image, mask = pixels(path), pixels(capture / "fg_masks" / path.name)
+        assert image.shape == (SIZE[1], SIZE[0], 3)
+        assert mask.shape == (SIZE[1], SIZE[0])
+        assert (image[mask == 0] == 255).all()
+        assert 0.25 < (mask > 0).mean() < 0.9
+        assert ((mask > 0) & (mask < 255)).sum() > 20
+        assert image[mask == 255].std() > 20  # texture and light, not a silhouette
+
+
+def test_same_seed_same_bytes_and_another_seed_another_person(head: HeadModel, tmp_path: Path) -> None:
+    options = {"cameras": 2, "timesteps": 2, "size": (24, 24), "head": head}
+    first = make_synthetic_capture(tmp_path / "a", seed=1, **options)
+    (tmp_path / "b").mkdir()  # an empty folder is welcome
+    again = make_synthetic_capture(tmp_path / "b", seed=1, **options)
+    assert every_byte(first) == every_byte(again)
+    other = make_synthetic_capture(tmp_path / "c", seed=2, **options)
+    difference = pixels(first / "images/00000_00.png").astype(float) - pixels(other / "images/00000_00.png")
+    assert np.abs(difference).mean() > 5
+
+
+def test_monocular(head: HeadModel, tmp_path: Path) -> None:
+    out = make_synthetic_capture(tmp_path / "mono", cameras=7, timesteps=5, size=(24, 32), head=head, monocular=True)
+    splits = {s: meta(out, f"_{s}")["frames"] for s in ("train", "val", "test")}
+    assert [f["timestep_index"] for f in splits["train"]] == [0, 1, 2, 3]
+    assert splits["val"] == []
+    assert [f["timestep_index"] for f in splits["test"]] == [4]
+    assert {f["camera_index"] for f in meta(out, "")["frames"]} == {0}
+
+
+def test_refusals(head: HeadModel, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for name in ("full", "file"):
+        with pytest.raises(DataError, match=f"{name}: already exists"):
+            make_synthetic_capture(tmp_path / name, head=head)
+    with pytest.raises(DataError, match="cannot write the capture"):
+        make_synthetic_capture(tmp_path / "file" / "inside", head=head, timesteps=2, cameras=2, size=(8, 8))
+    for wrong in ({"cameras": 1}, {"timesteps": 1}, {"size": (4, 400)}):
+        with pytest.raises(DataError, match="ask for"):
+            make_synthetic_capture(tmp_path / "new", head=head, **wrong)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "full"]
+    assert [p.name for p in (tmp_path / "full").iterdir()] == ["thesis.txt"]
+
+
+def test_an_interrupted_capture_leaves_nothing(head: HeadModel, tmp_path: Path) -> None:
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_synthetic_capture(tmp_path / "x", head=head, timesteps=2, cameras=2, size=(8, 8), progress=interrupt)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_person_is_not_in_the_model(person: Person, head: HeadModel) -> None:
+    """Hair rises by a centimetre or more, the shoulders are clearly wider than the bust, and both belong to the truth."""
+    verts, _ = person.posed()
+    thickness = np.linalg.norm(person.hair, axis=1)[person.masks["hair"][: len(person.hair)]]
+    assert 0.005 < np.median(thickness) < 0.05
+    assert np.ptp(verts[person.masks["shoulders"], 0]) > 1.4 * np.ptp(head.v_template[:, 0])
+    assert not (person.masks["face"] & person.masks["hair"]).any()
+
+
+def test_cloth_covers_the_bust(person: Person) -> None:
+    """Seen from all sides, nothing below the collar is skin."""
+    studio = Studio(person, make_look(person, np.random.default_rng(0)))
+    cast = studio.mesh.cast
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    import torch
+
+    middle = person.garment.mean(0)
+    away = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
+    starts = away + np.array([0.0, person.garment[:, 1].min() + 0.2, middle[2]])
+    _, face_ids, _ = cast(torch.tensor(starts, dtype=torch.float32), torch.tensor(-away, dtype=torch.float32))
+    assert (person.kinds[face_ids.numpy()] == 4).all()
+
+
+def test_rest_pose_is_the_shaped_head_and_a_root_turn_is_rigid(person: Person, head: HeadModel) -> None:
+    rest, _ = person.posed()
+    betas = person.betas
+    shaped = head.v_template + head.shapedirs[:, :, : head.n_shape].astype(np.float64) @ betas
+    n = len(person.hair)
+    np.testing.assert_allclose(rest[:n], person.fine @ shaped + person.hair, atol=1e-9)
+    root = (head.J_regressor.astype(np.float64) @ shaped)[0]
+    zero, turn = np.zeros(3), np.array([0.0, np.pi / 2, 0.0])
+    turned, rotations = person.posed(Pose(np.zeros(head.n_expr), turn, zero, zero, np.zeros(6), np.array([0.1, 0, 0])))
+    x, y, z = (rest - root).T
+    np.testing.assert_allclose(turned, np.column_stack([z, y, -x]) + root + [0.1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(rotations[0], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-6)
+
+
+def test_muscles_and_hair_follow_the_neck_by_millimetres(person: Person, head: HeadModel) -> None:
+    """What skinning alone does not give is there, is small, and is nothing at rest."""
+    assert not person._correctives(np.zeros(3)).any()
+    length = np.linalg.norm(person._correctives(np.array([0.1, 0.35, 0.1])), axis=1)
+    assert 0.002 < length.max() < 0.02
+
+
+def test_motion_is_smooth_and_uses_names(head: HeadModel) -> None:
+    poses = perform(head, 60, np.random.default_rng(0), turn=0.35)
+    neck = np.degrees([pose.neck_pose for pose in poses])
+    assert 15 < np.abs(neck[:, 1]).max() < 21
+    assert np.abs(np.diff(neck, axis=0)).max() < 4
+    assert max(pose.jaw_pose[0] for pose in poses) > 0.1
+    columns = action_columns(head)
+    assert {"smile", "blink"} <= set(columns)
+    assert all("blink" in head.expr_names[i].lower() for i in columns["blink"])
+
+
+def test_unnamed_directions_are_chosen_by_the_region_that_they_move(head: HeadModel) -> None:
+    from dataclasses import replace
+
+    columns = action_columns(replace(head, expr_names=()))
+    chosen = [int(c[0]) for c in columns.values()]
+    assert len(set(chosen)) == 3
+    eyes = (head.J_regressor @ head.v_template)[3:].mean(0)
+    motion = np.linalg.norm(head.shapedirs[:, :, head.n_shape + chosen[0]], axis=1)
+    height = float(np.average(head.v_template[:, 1] - eyes[1], weights=motion**2))
+    assert -0.09 < height < -0.03  # the mouth
+
+
+def test_subdivision_keeps_the_surface() -> None:
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    fine, more = subdivision(faces, 4)
+    verts = fine @ np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    assert len(more) == 32
+    assert len(verts) == 25
+    np.testing.assert_allclose(np.asarray(fine.sum(1)).ravel(), 1.0)
+    corners = verts[more]
+    areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    np.testing.assert_allclose(areas, 1 / 32)
+    np.testing.assert_allclose(vertex_normals(verts, more), np.tile([0.0, 0, 1], (25, 1)))
+
+
+def test_cameras_stand_around_the_face() -> None:
+    views = frontal_arc(16, (64, 64))
+    yaws = np.degrees([np.arctan2(v.position[0], v.position[2] + 0.02) for v in views])
+    assert yaws.min() < -55
+    assert yaws.max() > 55
+    assert abs(yaws[held_out_camera(16)]) < 12
+    assert sum(v.position[1] > 0 for v in views) == 8
+    assert abs(front_camera((64, 64)).position[0]) < 1e-9
+    assert len(frontal_arc(3, (64, 64))) == 3
