@@ -52,20 +52,20 @@ class View:
 
 
 @wp.func
-def blob(point: wp.vec3, center: wp.vec3, radius: float):
+def blob(point: wp.vec3, center: wp.vec3, radius: float) -> float:
     """1 at the centre, falling off as a Gaussian; symmetric left to right."""
     offset = (wp.vec3(wp.abs(point[0]), point[1], point[2]) - center) / radius
     return wp.exp(-0.5 * wp.dot(offset, offset))
 
 
 @wp.func
-def step_between(low: float, high: float, x: float):
+def step_between(low: float, high: float, x: float) -> float:
     t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 @wp.func
-def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32):
+def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32) -> float:
     """A random number of a lattice point, -1..1."""
     h = x * wp.uint32(73856093) ^ y * wp.uint32(19349663) ^ z * wp.uint32(83492791) ^ seed * wp.uint32(1640531527)
     h = (h ^ (h >> wp.uint32(15))) * wp.uint32(2146121005)
@@ -74,8 +74,8 @@ def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32):
 
 
 @wp.func
-def noise(seed: wp.uint32, point: wp.vec3):
-    """Value noise, -1..1: random numbers on the integer lattice, joined smoothly; several times faster than Perlin's."""
+def noise(seed: wp.uint32, point: wp.vec3) -> float:
+    """Value noise, -1..1: random numbers on the integer lattice, joined smoothly; much faster than Perlin's."""
     low = wp.vec3(wp.floor(point[0]), wp.floor(point[1]), wp.floor(point[2]))
     t = point - low
     f = wp.cw_mul(wp.cw_mul(t, t), wp.vec3(3.0, 3.0, 3.0) - 2.0 * t)
@@ -95,7 +95,7 @@ def noise(seed: wp.uint32, point: wp.vec3):
 
 
 @wp.func
-def noise2(seed: wp.uint32, x: float, y: float):
+def noise2(seed: wp.uint32, x: float, y: float) -> float:
     """Value noise in the plane, -1..1."""
     i, j = wp.floor(x), wp.floor(y)
     s, t = x - i, y - j
@@ -107,7 +107,7 @@ def noise2(seed: wp.uint32, x: float, y: float):
 
 
 @wp.func
-def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32):
+def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32) -> float:
     """Round spots, at most one in each cell of a grid [m]: 1 inside, 0 outside."""
     grid = point / cell
     corner = wp.vec3(wp.floor(grid[0]), wp.floor(grid[1]), wp.floor(grid[2]))
@@ -121,7 +121,7 @@ def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32):
 
 
 @wp.func
-def strands(point: wp.vec3, seed: wp.uint32):
+def strands(point: wp.vec3, seed: wp.uint32) -> float:
     """Brightness of hair, -1..1: noise stretched along the way from the crown outwards, in wavy clumps."""
     arm = point - wp.vec3(0.0, 0.0, -0.075)
     around = wp.atan2(arm[0], arm[2])
@@ -135,7 +135,7 @@ def strands(point: wp.vec3, seed: wp.uint32):
 
 
 @wp.func
-def brow(point: wp.vec3, look: Look):
+def brow(point: wp.vec3, look: Look) -> float:
     """Cover of the eyebrow hairs, 0..1: an arc above each eye, drawn as slanted strokes."""
     x = wp.abs(point[0])
     along = (x - 0.013) / 0.036
@@ -148,12 +148,13 @@ def brow(point: wp.vec3, look: Look):
 
 
 @wp.func
-def skin_color(point: wp.vec3, lips: float, look: Look):
+def skin_color(point: wp.vec3, lips: float, look: Look) -> wp.vec3:
     """Skin with mottling, flushed cheeks, freckles, stubble, brows and lips."""
     mottle = noise(look.seed, 55.0 * point) + 0.6 * noise(look.seed, 190.0 * point)
     pores = noise(look.seed, 620.0 * point)
     color = look.skin * (1.0 + 0.10 * mottle + 0.07 * pores)
-    flush = 0.75 * blob(point, wp.vec3(0.040, -0.028, 0.018), 0.016) + 0.7 * blob(point, wp.vec3(0.0, -0.030, 0.05), 0.012)
+    flush = 0.75 * blob(point, wp.vec3(0.040, -0.028, 0.018), 0.016)
+    flush += 0.7 * blob(point, wp.vec3(0.0, -0.030, 0.05), 0.012)
     flush += 0.5 * blob(point, wp.vec3(0.078, -0.01, -0.07), 0.022)
     color = wp.cw_mul(color, wp.vec3(1.0, 1.0 - 0.30 * flush, 1.0 - 0.26 * flush))
     sunny = 0.10 + blob(point, wp.vec3(0.026, -0.018, 0.03), 0.022)
@@ -177,7 +178,7 @@ def skin_color(point: wp.vec3, lips: float, look: Look):
 
 
 @wp.func
-def eye_color(point: wp.vec3, look: Look):
+def eye_color(point: wp.vec3, look: Look) -> wp.vec3:
     """Pupil, fibred iris with a dark rim, and a veined white."""
     center = wp.vec3(wp.sign(point[0]) * look.eye_offset[0], look.eye_offset[1], look.eye_offset[2])
     out = wp.normalize(point - center)
@@ -193,7 +194,7 @@ def eye_color(point: wp.vec3, look: Look):
 
 
 @wp.func
-def cloth_color(point: wp.vec3, collar: float, look: Look):
+def cloth_color(point: wp.vec3, collar: float, look: Look) -> wp.vec3:
     """A knitted weave with one of four patterns and a ribbed collar."""
     around = wp.atan2(point[0], point[2] + 0.08)
     across = 0.7 * around * (0.09 + 0.6 * wp.length(wp.vec2(point[0], point[2] + 0.08)))
@@ -201,7 +202,8 @@ def cloth_color(point: wp.vec3, collar: float, look: Look):
     if look.pattern == 1:
         ink = step_between(-0.25, 0.25, wp.sin(210.0 * point[1] + 3.0 * noise(look.seed, 9.0 * point)))
     elif look.pattern == 2:
-        ink = 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * across)) + 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * point[1]))
+        ink = 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * across))
+        ink += 0.5 * step_between(0.3, 0.5, wp.sin(170.0 * point[1]))
     elif look.pattern == 3:
         ink = step_between(0.55, 0.75, wp.sin(190.0 * across) * wp.sin(190.0 * point[1]))
     weave = wp.sin(2100.0 * point[1]) * wp.sin(1500.0 * point[0] + 1500.0 * point[2])
@@ -212,7 +214,7 @@ def cloth_color(point: wp.vec3, collar: float, look: Look):
 
 
 @wp.func
-def light_direction(i: int):
+def light_direction(i: int) -> wp.vec3:
     """From the surface to light i: key, fill and rim, fixed in the world."""
     if i == 0:
         return wp.normalize(wp.vec3(0.55, 0.65, 0.85))
@@ -222,7 +224,7 @@ def light_direction(i: int):
 
 
 @wp.func
-def light_color(i: int):
+def light_color(i: int) -> wp.vec3:
     if i == 0:
         return wp.vec3(1.72, 1.62, 1.48)
     if i == 1:
@@ -231,7 +233,7 @@ def light_color(i: int):
 
 
 @wp.func
-def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: float):
+def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: float) -> float:
     """Normalized Blinn-Phong with Schlick's Fresnel term."""
     half = wp.normalize(view + light)
     grazing = 1.0 - wp.max(wp.dot(view, half), 0.0)
@@ -240,7 +242,7 @@ def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: fl
 
 
 @wp.func
-def hair_gloss(flow: wp.vec3, normal: wp.vec3, view: wp.vec3, light: wp.vec3, shift: float):
+def hair_gloss(flow: wp.vec3, normal: wp.vec3, view: wp.vec3, light: wp.vec3, shift: float) -> float:
     """Highlight of a bundle of fibres along ``flow``, shifted towards the roots (Kajiya and Kay)."""
     tangent = wp.normalize(flow + shift * normal)
     along = wp.dot(tangent, wp.normalize(view + light))
@@ -248,7 +250,7 @@ def hair_gloss(flow: wp.vec3, normal: wp.vec3, view: wp.vec3, light: wp.vec3, sh
 
 
 @wp.func
-def encode(color: wp.vec3):
+def encode(color: wp.vec3) -> wp.vec3:
     """Linear to display values: a soft shoulder, then sRGB's power law (without its linear toe)."""
     out = wp.vec3()
     for i in range(3):
@@ -257,12 +259,12 @@ def encode(color: wp.vec3):
 
 
 @wp.func
-def mix3(values: wp.array[wp.vec3], corners: wp.vec3i, weights: wp.vec3):
+def mix3(values: wp.array[wp.vec3], corners: wp.vec3i, weights: wp.vec3) -> wp.vec3:
     return values[corners[0]] * weights[0] + values[corners[1]] * weights[1] + values[corners[2]] * weights[2]
 
 
 @wp.func
-def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3):
+def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3) -> float:
     """1 where nothing stands between the point and the key light; a hard shadow, softened by the pixel's samples."""
     hit = wp.mesh_query_ray(mesh, point + 0.002 * normal + 0.001 * light, light, FAR)
     return wp.where(hit.result, 0.25, 1.0)
@@ -272,7 +274,7 @@ def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3):
 def shade(
     mesh: wp.uint64, kind: int, rest: wp.vec3, marks: wp.vec4, point: wp.vec3, normal_in: wp.vec3, flow: wp.vec3,
     view: wp.vec3, look: Look,
-):  # fmt: skip
+) -> wp.vec3:  # fmt: skip
     """Light that leaves a point towards the camera; ``marks`` are hair, lips, open sky and collar, 0..1."""
     threads = wp.float32(0.0)
     hair = wp.float32(0.0)
@@ -314,8 +316,8 @@ def shade(
         fibre = wp.float32(0.0)
         if hair > 0.0:
             fibre = hair * hair_gloss(flow, normal, view, light, 0.12 + 0.25 * threads) * facing
-        sheen = wp.cw_mul(light_color(i), wp.vec3(1.0, 1.0, 1.0) * skin_gloss + fibre * (1.2 * look.hair_light + wp.vec3(0.03, 0.03, 0.03)))
-        total += (wp.cw_mul(color, light_color(i)) * (0.75 * facing) + sheen) * reach
+        sheen = wp.vec3(1.0, 1.0, 1.0) * skin_gloss + fibre * (1.2 * look.hair_light + wp.vec3(0.03, 0.03, 0.03))
+        total += wp.cw_mul(0.75 * facing * color + sheen, light_color(i)) * reach
     return encode(total)
 
 
@@ -335,7 +337,7 @@ def _portrait_kernel(
     flows: wp.array[wp.vec3],  # [V]
     # Out:
     pixels: wp.array[wp.vec4],  # [P]
-):
+) -> None:
     n = first + wp.tid()
     corner = view.corner + wp.vec2(float(n % view.columns), float(n // view.columns))
     total = wp.vec4()

@@ -18,7 +18,7 @@ FAR = wp.constant(1.0e30)
 
 
 @wp.func
-def is_ray(origin: wp.vec3, direction: wp.vec3):
+def is_ray(origin: wp.vec3, direction: wp.vec3) -> bool:
     """Whether a ray can hit anything; written so that NaN, infinity and a zero direction are all refused."""
     length = wp.length_sq(direction)
     return length > 0.0 and length < FAR and wp.length_sq(origin) < FAR
@@ -35,7 +35,7 @@ def _ray_cast_kernel(
     depths: wp.array[float],  # [N]
     face_ids: wp.array[wp.int32],  # [N]
     barycentrics: wp.array[wp.vec3],  # [N]
-):
+) -> None:
     n = first + wp.tid()
     depth = float(wp.inf)
     face = wp.int32(-1)

@@ -184,7 +184,7 @@ def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path
         found = (base / relative).resolve(strict=True)
     except FileNotFoundError as error:
         raise DataError(f"{where}: {shown} does not exist") from error
-    except (OSError, RuntimeError) as error:  # too long, a folder that is a file, a loop of links
+    except (OSError, RuntimeError, ValueError) as error:  # too long, a file as a folder, a loop of links, no text
         raise DataError(f"{where}: {shown} cannot be opened ({type(error).__name__})") from error
     if not found.is_relative_to(allowed):
         raise outside

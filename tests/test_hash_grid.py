@@ -5,8 +5,8 @@ import torch
 from checks import assert_gradcheck, assert_matches_twin, assert_same_bits
 from twins import mesh as twins
 
-from mgavatar.kernels.hash_grid import HashGrid, HashGridShape, hash_encode
-from mgavatar.kernels.hash_grid import _TableGradient as TableGradient
+from mgavatar.kernels.hash_encode import TableGradient, hash_encode
+from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 
 SMALL = HashGridShape(levels=6, base_resolution=4, max_resolution=90, log2_table_size=10)
 

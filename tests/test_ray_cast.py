@@ -19,7 +19,7 @@ from mgavatar.kernels.ray_cast import RayMesh, camera_rays, ray_cast
 def brute_force(verts: np.ndarray, faces: np.ndarray, origins: np.ndarray, directions: np.ndarray):
     """Möller and Trumbore (1997) for every ray and face in float64.
 
-    Returns depth [N], face [N], barycentrics [N, 3], and how far each ray stays from the nearest edge [N] (barycentric).
+    Returns depth [N], face [N], barycentrics [N, 3], and how far each ray stays from any edge (barycentric) [N].
     """
     a, b, c = (verts[faces[:, i]].astype(np.float64)[None] for i in range(3))
     o, d = origins.astype(np.float64)[:, None], directions.astype(np.float64)[:, None]

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
+
 from mgavatar.capture.synthetic import make_synthetic_capture
 from mgavatar.capture.synthetic_image import Studio, front_camera, frontal_arc, held_out_camera, make_look
 from mgavatar.capture.synthetic_motion import action_columns, perform
@@ -14,7 +18,6 @@ from mgavatar.capture.synthetic_person import Person, Pose, make_person, subdivi
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
 from mgavatar.head.procedural import build_head
-from PIL import Image
 
 SIZE = (48, 40)
 KEYS = {"shape", "expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation"}
@@ -87,8 +90,10 @@ def test_frames_name_existing_files_and_hold_the_fields_keys(capture: Path) -> N
 
 
 def test_splits_are_disjoint_and_mean_what_they_say(capture: Path) -> None:
-    members = {s: {(f["timestep_index"], f["camera_index"]) for f in meta(capture, s)["frames"]} for s in ("_train", "_val", "_test")}
-    train, val, test = members.values()
+    train, val, test = (
+        {(f["timestep_index"], f["camera_index"]) for f in meta(capture, split)["frames"]}
+        for split in ("_train", "_val", "_test")
+    )
     assert train | val | test == {(t, c) for t in range(3) for c in range(4)}
     assert len(train) + len(val) + len(test) == 12
     assert val == {(t, held_out_camera(4)) for t in range(2)}
@@ -207,7 +212,7 @@ def test_an_interrupted_capture_leaves_nothing(head: HeadModel, tmp_path: Path) 
 
 
 def test_the_person_is_not_in_the_model(person: Person, head: HeadModel) -> None:
-    """Hair rises by a centimetre or more, the shoulders are clearly wider than the bust, and both belong to the truth."""
+    """Hair rises by about a centimetre, and the shoulders are clearly wider than the template's bust."""
     verts, _ = person.posed()
     thickness = np.linalg.norm(person.hair, axis=1)[person.masks["hair"][: len(person.hair)]]
     assert 0.005 < np.median(thickness) < 0.05
@@ -218,14 +223,11 @@ def test_the_person_is_not_in_the_model(person: Person, head: HeadModel) -> None
 def test_cloth_covers_the_bust(person: Person) -> None:
     """Seen from all sides, nothing below the collar is skin."""
     studio = Studio(person, make_look(person, np.random.default_rng(0)))
-    cast = studio.mesh.cast
     angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
-    import torch
-
     middle = person.garment.mean(0)
     away = np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)])
     starts = away + np.array([0.0, person.garment[:, 1].min() + 0.2, middle[2]])
-    _, face_ids, _ = cast(torch.tensor(starts, dtype=torch.float32), torch.tensor(-away, dtype=torch.float32))
+    _, face_ids, _ = studio.mesh.cast(torch.tensor(starts).float(), torch.tensor(-away).float())
     assert (person.kinds[face_ids.numpy()] == 4).all()
 
 
@@ -262,8 +264,6 @@ def test_motion_is_smooth_and_uses_names(head: HeadModel) -> None:
 
 
 def test_unnamed_directions_are_chosen_by_the_region_that_they_move(head: HeadModel) -> None:
-    from dataclasses import replace
-
     columns = action_columns(replace(head, expr_names=()))
     chosen = [int(c[0]) for c in columns.values()]
     assert len(set(chosen)) == 3

@@ -1,7 +1,7 @@
 """Synthetic captures: ray-traced pictures of a person who is not in the head model, with exact geometry beside them.
 
-They take the place of licensed data in trials, tests and the demo. The pictures come from a ray tracer and the motion from
-a float64 skinning of its own, so that nothing of the method that is fitted to them made them.
+They take the place of licensed data in trials, tests and the demo. The pictures come from a ray tracer and the motion
+from a float64 skinning of its own: no part of the method that is fitted to them made them.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ def make_synthetic_capture(
 ) -> Path:
     """Ray-trace a capture of a synthetic person in the VHAP / GaussianAvatars layout.
 
-    The person has a drawn identity, hair, clothed shoulders twice as wide as the bust, and muscles that move, none of
-    which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes the
-    first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps (empty for one camera) and
-    ``test`` all cameras at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same
+    The person has a drawn identity, hair, clothed shoulders far wider than the bust, and muscles that move, none of
+    which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes
+    the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps (empty for one camera)
+    and ``test`` all cameras at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same
     arguments write the same bytes.
 
     Args:
@@ -89,7 +89,8 @@ def make_synthetic_capture(
             out.rmdir()
         partial.rename(out)
     except OSError as error:
-        raise DataError(f"{out}: cannot write the capture ({error.strerror or error}); choose another folder") from error
+        reason = error.strerror or str(error)
+        raise DataError(f"{out}: cannot write the capture ({reason}); choose another folder") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return out
@@ -99,7 +100,9 @@ def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, mo
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DataError(f"{out}: already exists and is not an empty folder; choose another folder or remove it")
     if cameras < 2 and not monocular:
-        raise DataError(f"{out}: a capture from {cameras} cameras has none to hold out; ask for 2 or more, or for a monocular one")
+        raise DataError(
+            f"{out}: {cameras} cameras leave none to hold out; ask for 2 or more, or for a monocular capture"
+        )
     if timesteps < 2:
         raise DataError(f"{out}: {timesteps} timesteps cannot be split into training and test; ask for 2 or more")
     if min(size) < 8:
@@ -181,11 +184,13 @@ def _write_transforms(root: Path, views: list[Camera], members: dict[Split, set[
     for name, chosen in (("", every), *((f"_{split}", sorted(members[split])) for split in SPLITS)):
         frames = [_frame(t, c, views[c]) for t, c in chosen]
         lens = _lens(views[-1])
-        indices = {
+        meta = {
+            "frames": frames,
+            **lens,
             "timestep_indices": sorted({t for t, _ in chosen}),
             "camera_indices": sorted({c for _, c in chosen}),
         }
-        (root / f"transforms{name}.json").write_text(json.dumps({"frames": frames, **lens, **indices}, indent=1), "utf-8")
+        (root / f"transforms{name}.json").write_text(json.dumps(meta, indent=1), "utf-8")
 
 
 def _frame(t: int, c: int, camera: Camera) -> dict[str, Any]:
@@ -241,5 +246,5 @@ def _write_truth(
     )
 
 
-def _save_arrays(path: Path, **arrays: np.ndarray) -> None:
+def _save_arrays(path: Path, **arrays: Any) -> None:
     np.savez_compressed(path, **arrays)

@@ -11,8 +11,8 @@ _COLUMNS, _ROWS = 128, 80
 _CLEARANCE = 0.005
 """Distance of the cloth from the skin under it [m]."""
 
-# Along the cloth, from the collar (0) to the hem (1): height at the front, the side and the back, from the middle of the
-# eyes [m]; half the width; depth to the front and to the back of the neck's axis [m].
+# Along the cloth, from the collar (0) to the hem (1): height at the front, the side and the back, from the middle of
+# the eyes [m]; half the width; depth to the front and to the back of the neck's axis [m].
 _KNOTS = np.array([0.0, 0.07, 0.22, 0.42, 0.60, 0.75, 1.0])
 _FRONT_Y = np.array([-0.168, -0.176, -0.195, -0.225, -0.265, -0.310, -0.460])
 _SIDE_Y = np.array([-0.126, -0.131, -0.143, -0.160, -0.186, -0.240, -0.460])

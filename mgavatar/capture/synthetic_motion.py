@@ -40,8 +40,8 @@ def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: 
     jaw = 0.02 + 0.17 * np.sin(np.pi * (2.6 * u + 0.15 + 0.2 * phase[3])) ** 4
     gaze_x = 0.12 * np.sin(2 * np.pi * 1.1 * u + 1.0 + phase[4])
     gaze_y = -0.35 * yaw + 0.16 * np.sin(2 * np.pi * 1.7 * u + phase[5])
-    sway = 0.045 * np.stack([0.6 * np.sin(5 * u + phase[6]), np.sin(7 * u + phase[7]), 0.5 * np.sin(6 * u + phase[8])], 1)
-    shift = 0.006 * np.stack([np.sin(6 * u + phase[9]), 0.5 * np.sin(8 * u + phase[10]), np.sin(5 * u + phase[11])], 1)
+    sway = np.sin(np.outer(u, [5, 7, 6]) + phase[6:9]) * [0.027, 0.045, 0.022]
+    shift = np.sin(np.outer(u, [6, 8, 5]) + phase[9:12]) * [0.006, 0.003, 0.006]
     zero = 0.0 * u
     neck = np.stack([pitch, yaw, roll], axis=1)
     eyes = np.stack([gaze_x, gaze_y, zero, gaze_x, gaze_y, zero], axis=1)
@@ -72,7 +72,7 @@ def tracked(poses: list[Pose], rng: np.random.Generator) -> list[Pose]:
 
 
 def action_columns(head: HeadModel) -> dict[str, np.ndarray]:
-    """Expression directions of each action: by their names or, where names say nothing, by the region that they move."""
+    """Expression directions of each action: by name or, where names say nothing, by the region that they move."""
     names = ["".join(c for c in name.lower() if c.isalnum()) for name in head.expr_names]
     found = {
         action: np.array([i for i, name in enumerate(names) if any(word in name for word in words)], int)

@@ -99,7 +99,7 @@ class Person:
 
 def make_person(head: HeadModel, rng: np.random.Generator) -> Person:
     """Draw identity, hair style and garment."""
-    betas = 0.8 * rng.standard_normal(head.n_shape)
+    betas = 0.7 * np.clip(rng.standard_normal(head.n_shape), -2.0, 2.0)
     neutral = np.zeros(head.n_expr)
     shaped = shaped_vertices(head, betas, neutral)
     fine, head_faces = subdivision(head.faces, len(shaped))
@@ -194,7 +194,7 @@ def hairline(around: np.ndarray) -> np.ndarray:
 def comb(
     rest: np.ndarray, shaped: np.ndarray, faces: np.ndarray, regions: dict[str, np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hair of a drawn style: its cover 0..1, shape [H], and the offsets that raise it from the scalp [m], shape [H, 3]."""
+    """Hair of a drawn style: its cover, 0..1, shape [H], and its offsets from the scalp [m], shape [H, 3]."""
     top, side, fall, wave = rng.uniform([0.012, 0.009, 0.0, 1.5], [0.028, 0.022, 0.05, 6.0])
     fall = 0.0 if fall < 0.018 else fall  # short hair has no fall
     parting, phases = rng.uniform(-0.9, 0.9), rng.uniform(0.0, 2 * np.pi, 8)
@@ -215,7 +215,8 @@ def comb(
     direction = 0.55 * normals + 0.45 * outward
     offsets = direction * (thick * rise * (0.72 + 0.45 * clumps))[:, None]
     fringe = np.exp(-0.5 * (around / 0.75) ** 2) * _ramp(y, 0.045, 0.075) * cover
-    offsets += fringe[:, None] * (0.5 * top) * np.array([0.25 * np.sign(parting), -0.35, 0.75]) * (0.6 + 0.6 * clumps)[:, None]
+    sweep = 0.5 * top * np.array([0.25 * np.sign(parting), -0.35, 0.75])
+    offsets += (fringe * (0.6 + 0.6 * clumps))[:, None] * sweep
     hang = fall * cover * _ramp(-y, -0.05, 0.08) * _ramp(np.abs(around), 1.3, 2.1)
     offsets += hang[:, None] * (np.array([0.0, -1.0, 0.0]) + 0.35 * outward) * (0.8 + 0.4 * clumps)[:, None]
     return cover, offsets
@@ -245,10 +246,10 @@ def _clumps(around: np.ndarray, above: np.ndarray, wave: float, phases: np.ndarr
 
 def _materials(faces: np.ndarray, regions: dict[str, np.ndarray]) -> np.ndarray:
     kinds = np.full(len(faces), SKIN)
-    for kind, names in ((MOUTH, ("mouth_socket", "mouth", "mouth_interior")), (TEETH, ("teeth",)), (EYE, ("eyeballs",))):
-        for name in names:
-            if name in regions:
-                kinds[(regions[name][faces] > 0.999).all(axis=1)] = kind
+    parts = {"mouth_socket": MOUTH, "mouth": MOUTH, "mouth_interior": MOUTH, "teeth": TEETH, "eyeballs": EYE}
+    for name, kind in parts.items():
+        if name in regions:
+            kinds[(regions[name][faces] > 0.999).all(axis=1)] = kind
     return kinds
 
 

@@ -208,7 +208,8 @@ def _viewmat(reader: _Reader) -> np.ndarray:
     if not np.all(np.isfinite(pose)):
         raise DataError(f"{reader.where}: transform_matrix holds NaN or infinity; remove the frame or track it again")
     rotation = pose[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
+    bounded = np.abs(pose).max() < 1e6  # before products that would overflow
+    rigid = bounded and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0
     if not rigid or not np.allclose(pose[3], [0.0, 0.0, 0.0, 1.0], atol=1e-6):
         raise DataError(f"{reader.where}: transform_matrix is not a rotation and a translation")
     return np.linalg.inv(pose @ OPENGL_TO_OPENCV)

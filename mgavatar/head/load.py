@@ -249,9 +249,9 @@ def _count(value: np.ndarray, *, where: str) -> int:
 
 
 def _text(value: np.ndarray, *, path: Path) -> str:
-    if value.size != 1 or value.dtype.kind not in "US":
+    if value.size != 1 or value.dtype.kind != "U":
         raise DataError(f"{path}: expr_basis must be one word, such as flame2023")
-    return one_line(np.char.decode(value, "latin1") if value.dtype.kind == "S" else value.reshape(()), limit=60)
+    return one_line(value.item(), limit=60)
 
 
 def _names(value: np.ndarray | None, n_expr: int, *, path: Path) -> tuple[str, ...]:

@@ -44,7 +44,7 @@ def _ring(skin: Callable[[Array], Array], centre: Array, row: Array, t: Array) -
     plate = 0.60 * np.maximum(back + 0.011 - LEAN * up, 0.0)
     lobe = 1.0 - 0.75 * smoothstep(0.45, 0.95, -s)
     lift = row[3] / 1000.0 * (behind * 0.85 + 0.15) * lobe
-    tragus = 0.0038 * np.exp(-((c + 1.0) / 0.10) ** 2) * np.exp(-(((size - 0.60) / 0.14) ** 2))
+    tragus = 0.0038 * np.exp(-(((c + 1.0) / 0.10) ** 2)) * np.exp(-(((size - 0.60) / 0.14) ** 2))
     out = row[2] * plate + lift + tragus
     return foot + out[:, None] * np.array([0.96, 0.0, 0.12])
 

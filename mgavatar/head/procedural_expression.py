@@ -19,6 +19,10 @@ LID_REACH = (1.0, 0.86, 0.66, 0.42, 0.18, 0.0)
 """Share of the lid's rotation that the rings from its edge outwards take."""
 
 
+SOCKET_SHARE = (0.9, 0.6, 0.3, 0.1, 0.0, 0.0)
+"""How much the rings inside the mouth follow the edge of the lips."""
+
+
 class Pull(NamedTuple):
     """A bell on the featureless face that moves one way; [mm]."""
 
@@ -30,7 +34,14 @@ class Pull(NamedTuple):
 
 # Left halves of mirrored pairs: name_L is as written, name_R its mirror image.
 PAIRS: tuple[tuple[str, tuple[Pull, ...]], ...] = (
-    ("smile", (Pull((25, -46), (15, 13), (5.5, 6.5, -4)), Pull((36, -14), (15, 13), (1, 3, 2.5)), Pull((10, -47), (9, 10), (1, 0.5, -1)))),
+    (
+        "smile",
+        (
+            Pull((25, -46), (15, 13), (5.5, 6.5, -4)),
+            Pull((36, -14), (15, 13), (1, 3, 2.5)),
+            Pull((10, -47), (9, 10), (1, 0.5, -1)),
+        ),
+    ),
     ("frown", (Pull((25, -49), (12, 11), (0.5, -7, -1)), Pull((18, -64), (12, 10), (0, -2, 0.5)))),
     ("upper_lip_raise", (Pull((11, -40), (10, 9), (0, 5.5, 1), "upper"), Pull((16, -22), (9, 9), (0, 2, 0.8)))),
     ("lower_lip_depress", (Pull((11, -55), (10, 9), (0, -5.5, 0.5), "lower"),)),
@@ -79,23 +90,21 @@ def _details() -> list[tuple[str, tuple[Pull, ...]]]:
 
 
 class _Face:
-    """What all directions need: where each vertex is on the featureless face, and who may move."""
+    """What all directions need: where each vertex is on the featureless face, and how far it may move."""
 
-    def __init__(self, mesh: HeadMesh, jaw: Array) -> None:
-        self.mesh, self.jaw = mesh, jaw
-        self.rest = mesh.rest.copy()
-        self.movable = (mesh.part == "skin") * smoothstep(-0.045, -0.005, np.nan_to_num(mesh.rest[:, 2], nan=-1.0))
-        self.movable *= 1.0 - smoothstep(-0.085, -0.105, -np.abs(np.nan_to_num(mesh.rest[:, 1])))
-        lips = mesh.groups["lip_0"]
-        for k, share in enumerate((1.0, 0.9, 0.6, 0.3, 0.1, 0.0, 0.0)):
-            for follow in (lambda ids: ids, lambda ids: mesh.mirror[ids]):
-                ids = follow(mesh.groups[f"socket_{k}"])
-                self.rest[ids] = mesh.rest[follow(lips)]
-                self.movable[ids] *= 1.0
-                if k:
-                    self.movable[ids] = share
-        self.rest = np.nan_to_num(self.rest, nan=-1.0)
+    def __init__(self, mesh: HeadMesh) -> None:
+        self.mesh = mesh
+        self.rest = np.nan_to_num(mesh.rest, nan=-1.0)
+        height = np.abs(self.rest[:, 1])
+        self.movable = smoothstep(-0.045, -0.005, self.rest[:, 2]) * (1.0 - smoothstep(0.085, 0.105, height))
+        for k, share in enumerate(SOCKET_SHARE, start=1):
+            ids, lips = mesh.groups[f"socket_{k}"], mesh.groups["lip_0"]
+            for inner, outer in ((ids, lips), (mesh.mirror[ids], mesh.mirror[lips])):
+                self.rest[inner], self.movable[inner] = self.rest[outer], share
         self.upper = smoothstep(-0.0042, 0.0042, self.rest[:, 1] - form.MOUTH_Y)
+        from_eye = np.stack([np.abs(self.rest[:, 0]), self.rest[:, 1]], axis=1) - form.EYE[:2]
+        # Only lid directions move the lids.
+        self.movable *= smoothstep(0.75, 1.45, np.linalg.norm(from_eye / [0.0175, 0.0105], axis=1))
 
     def pulls(self, pulls: tuple[Pull, ...]) -> Array:
         """The displacement of some pulls, shape [V, 3] [m]."""
@@ -105,13 +114,7 @@ class _Face:
             weight = self.movable * np.exp(-np.sum(offset**2, axis=1))
             weight *= {"all": 1.0, "upper": self.upper, "lower": 1.0 - self.upper}[pull.zone]
             out += weight[:, None] * np.array(pull.shift) / 1000.0
-        return out * (1.0 - self.near_eye())[:, None]
-
-    def near_eye(self) -> Array:
-        """1 on the edge of the lids, falling to 0 around the sockets: only lid directions move the lids."""
-        offset = (np.abs(self.rest[:, :2] * [1.0, 1.0]) * [1.0, 1.0] - form.EYE[:2] * [1.0, 1.0]) / [0.0175, 0.0105]
-        offset[:, 1] = (self.rest[:, 1] - form.EYE[1]) / 0.0105
-        return 1.0 - smoothstep(0.75, 1.45, np.linalg.norm(offset, axis=1))
+        return out
 
     def left(self) -> Array:
         """1 on the left, 0 on the right, smooth across the middle, shape [V, 1]."""
@@ -142,7 +145,7 @@ def lid_direction(mesh: HeadMesh, *, upper: float, lower: float) -> Array:
     turn = np.arcsin(np.clip(meet / radius, -1, 1)) - np.arctan2(at[:, 1], at[:, 2])
     turn *= np.where(is_upper, upper, lower)
     out = np.zeros_like(mesh.verts)
-    shares = [(f"lid_{k}", share) for k, share in enumerate(LID_REACH)] + [("lid_margin", 1.0), ("lid_inner", 0.9)]
+    shares = [(f"lid_{k}", share) for k, share in enumerate(LID_REACH)] + [("lid_margin", 1.0), ("lid_inner", 0.4)]
     for group, share in shares:
         ids = mesh.groups[group]
         out[ids] = _rotate_about_eye(mesh.verts[ids], turn * share)
@@ -153,7 +156,9 @@ def jaw_directions(mesh: HeadMesh, jaw: Array) -> list[tuple[str, Array]]:
     """Motions of the jaw's own part of the mesh, shape [V, 3] each [m]."""
     from_joint = mesh.verts - JOINTS_AT[2]
     c, s = np.cos(0.22), np.sin(0.22)
-    opened = np.stack([from_joint[:, 0], from_joint[:, 1] * c - from_joint[:, 2] * s, from_joint[:, 1] * s + from_joint[:, 2] * c], 1)
+    opened = np.stack(
+        [from_joint[:, 0], from_joint[:, 1] * c - from_joint[:, 2] * s, from_joint[:, 1] * s + from_joint[:, 2] * c], 1
+    )
     motions = {"jaw_open": opened - from_joint}
     motions["jaw_left"] = np.broadcast_to(np.array([0.006, 0.0, 0.0]), from_joint.shape)
     motions["jaw_right"] = np.broadcast_to(np.array([-0.006, 0.0, 0.0]), from_joint.shape)
@@ -168,7 +173,7 @@ def expression_directions(mesh: HeadMesh, jaw: Array) -> tuple[Array, tuple[str,
         mesh: The mesh.
         jaw: How much each vertex follows the jaw, shape [V].
     """
-    face = _Face(mesh, jaw)
+    face = _Face(mesh)
     named: list[tuple[str, Array]] = []
 
     def add_pair(name: str, left: Array) -> None:

@@ -62,15 +62,15 @@ NAMED: tuple[tuple[str, Field], ...] = (
     ("face_length", _sum(_within(_spread((0, 1, 0)), (-150, -100, 300, 301)), _bell((0, -85, 20), (60, 30, 60), (0, -0.03, 0)))),
     ("depth", _within(_spread((0, 0, 1)), (-120, -80, 300, 301))),
     ("jaw_width", _within(_spread((1, 0, 0)), (-115, -85, -55, 0))),
+    ("face_width", _front(_within(_spread((1, 0, 0)), (-80, -40, 30, 60)))),
     ("neck_width", _within(_spread((1, 0, 1)), (-180, -150, -115, -80))),
     ("shoulders", _within(_spread((1, 0.2, 0.4)), (-400, -300, -185, -140))),
-    ("face_width", _front(_within(_spread((1, 0, 0)), (-80, -40, 30, 60)))),
+    ("skull_height", _bell((0, 140, -45), (80, 50, 90), (0, 1, 0))),
+    ("skull_back", _bell((0, 40, -135), (70, 60, 50), (0, 0, -1))),
     ("chin", _bell((0, -82, 40), (30, 24, 40), (0, -0.5, 1))),
     ("nose_length", _bell((0, -14, 62), (16, 16, 26), (0, -0.4, 1))),
     ("cheeks", _bell((44, -28, 18), (20, 26, 30), (1, 0, 0.6))),
     ("brow", _bell((24, 43, 42), (24, 12, 24), (0, -0.2, 1))),
-    ("skull_back", _bell((0, 40, -135), (70, 60, 50), (0, 0, -1))),
-    ("skull_height", _bell((0, 140, -45), (80, 50, 90), (0, 1, 0))),
     ("nose_width", _bell((11, -17, 50), (9, 10, 16), (1, 0, 0.1))),
     ("ears_out", _bell((80, 3, -58), (20, 36, 26), (1, 0, 0.2))),
     ("ears_height", _bell((80, 22, -58), (20, 26, 26), (0.1, 1, -0.2))),
@@ -90,7 +90,10 @@ NAMED: tuple[tuple[str, Field], ...] = (
     ("nose_aside", _bell((0, -10, 60), (13, 22, 24), (1, 0, 0))),
     ("chin_aside", _bell((0, -82, 36), (30, 24, 40), (1, 0, 0))),
 )  # fmt: skip
-AMPLITUDE_MM = (2.4, 1.9, 1.8, 1.6, 1.2, 1.1, 1.1, 1.0, 1.0, 0.8)
+AMPLITUDE_MM = (2.4, 2.0, 1.8, 1.6, 1.3, 1.1, 1.0, 1.0, 0.9, 0.8)
+"""Root mean square of the first directions over all vertices."""
+LARGEST_MM = 7.0, 2.6
+"""No vertex moves farther than that for one standard deviation: the first directions, the others."""
 
 
 def _waves(rng: np.random.Generator, wavelength: float, *, symmetric: bool) -> Field:
@@ -134,7 +137,10 @@ def identity_directions(mesh: HeadMesh) -> Array:
     flat = raw.reshape(-1, N_SHAPE)
     q, r = np.linalg.qr(flat)
     q = q * np.sign(np.diag(r))
-    rms = 0.30 * (10.0 / np.arange(1, N_SHAPE + 1)) ** 0.9
+    rms = 0.32 * (len(NAMED) / np.maximum(np.arange(N_SHAPE), len(NAMED))) ** 0.9
+    rms[: len(NAMED)] = 0.7
     rms[: len(AMPLITUDE_MM)] = AMPLITUDE_MM
-    rms[len(AMPLITUDE_MM) : len(NAMED)] = np.linspace(0.75, 0.35, len(NAMED) - len(AMPLITUDE_MM))
-    return (q * rms / 1000.0 * np.sqrt(len(verts))).reshape(raw.shape)
+    directions = (q * np.sqrt(len(verts))).reshape(raw.shape)
+    limit = np.where(np.arange(N_SHAPE) < len(AMPLITUDE_MM), *LARGEST_MM)
+    scale = np.minimum(rms, limit / np.linalg.norm(directions, axis=1).max(axis=0))
+    return directions * scale / 1000.0

@@ -50,7 +50,9 @@ def eyeball_half() -> tuple[Part, ...]:
     polar = np.radians(EYE_RINGS_DEG)
     around = np.linspace(0.0, 2 * np.pi, N_EYE_AROUND, endpoint=False)
     n_rings = len(polar) - 2
-    ring = np.stack([np.outer(np.sin(polar[1:-1]), np.cos(around)), np.outer(np.sin(polar[1:-1]), np.sin(around))], axis=-1)
+    ring = np.stack(
+        [np.outer(np.sin(polar[1:-1]), np.cos(around)), np.outer(np.sin(polar[1:-1]), np.sin(around))], axis=-1
+    )
     z = np.broadcast_to(np.cos(polar[1:-1])[:, None, None], (n_rings, N_EYE_AROUND, 1))
     sphere = np.concatenate([[[0.0, 0.0, 1.0]], np.concatenate([ring, z], axis=-1).reshape(-1, 3), [[0.0, 0.0, -1.0]]])
     ids = 1 + np.arange(n_rings * N_EYE_AROUND).reshape(n_rings, N_EYE_AROUND)

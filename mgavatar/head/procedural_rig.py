@@ -7,7 +7,8 @@ from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from mgavatar.head import procedural_surface as form
-from mgavatar.head.procedural_mesh import RED_RINGS, HeadMesh
+from mgavatar.head.procedural_mesh import HeadMesh
+from mgavatar.head.procedural_sheet import RED_RINGS
 from mgavatar.head.procedural_surface import smoothstep
 
 Array = np.ndarray
@@ -51,8 +52,12 @@ def jaw_share(mesh: HeadMesh) -> Array:
     below = (mesh.part == "skin") & (y < form.MOUTH_Y - 0.002) & (y > -0.088) & (z > 0.012) & (x < 0.022)
     socket = mesh.part == "socket"
     below |= socket & (verts[:, 1] < form.MOUTH_Y - 0.0055) & (verts[:, 2] > 0.010)
-    above = (mesh.part == "skin") & (((y > form.MOUTH_Y + 0.002) & (x < 0.020)) | (y > -0.012) | (z < -0.046) | (y < -0.112))
-    above |= socket & ((verts[:, 1] > form.MOUTH_Y + 0.0055) | (verts[:, 2] < 0.010) & (verts[:, 1] > form.MOUTH_Y - 0.004))
+    above = (mesh.part == "skin") & (
+        ((y > form.MOUTH_Y + 0.002) & (x < 0.020)) | (y > -0.012) | (z < -0.046) | (y < -0.112)
+    )
+    above |= socket & (
+        (verts[:, 1] > form.MOUTH_Y + 0.0055) | (verts[:, 2] < 0.010) & (verts[:, 1] > form.MOUTH_Y - 0.004)
+    )
     neighbours = _neighbours(mesh)
     share = below.astype(float)
     free = ~(below | above) & ((mesh.part == "skin") | socket)

@@ -107,16 +107,11 @@ NOSE_PYRAMID_MM = np.array(
 NOSTRIL_MM = ((6.2, -23.0, 55.0), (3.4, 4.5, 5.5), (0.0, 3.5, -2.5))
 
 _splines = {
-    name: CubicSpline(
-        np.arange(N_LEVELS), SECTIONS[:, i], bc_type=((1, 0.0) if name.startswith("y") else "natural", "natural")[:1] * 2
-    )
-    for i, name in enumerate(("zf", "yf", "xs", "zs", "ys", "zb", "yb", "n"))
+    # The heights are level at the crown, where all sections meet.
+    name: CubicSpline(np.arange(N_LEVELS), column, bc_type=((1, 0.0) if name[0] == "y" else "natural", "natural"))
+    for name, column in zip(("zf", "yf", "xs", "zs", "ys", "zb", "yb", "square"), SECTIONS.T, strict=True)
 }
-
-
-_nose_pyramid = [
-    PchipInterpolator(-NOSE_PYRAMID_MM[:, 0], NOSE_PYRAMID_MM[:, i], extrapolate=True) for i in (1, 2)
-]
+_nose_pyramid = [PchipInterpolator(-NOSE_PYRAMID_MM[:, 0], NOSE_PYRAMID_MM[:, i], extrapolate=True) for i in (1, 2)]
 
 
 def smoothstep(low: float | np.ndarray, high: float | np.ndarray, value: np.ndarray) -> np.ndarray:
@@ -129,7 +124,7 @@ def base(angle: np.ndarray, level: np.ndarray) -> np.ndarray:
     """The head without features: a rounded section at each level, shape [..., 3]."""
     row = {name: spline(level) for name, spline in _splines.items()}
     c, s = np.cos(angle), np.sin(angle)
-    n = np.where(c > 0, row["n"], 2.0)
+    n = np.where(c > 0, row["square"], 2.0)
     radius = (np.abs(c) ** n + np.abs(s) ** n) ** (-1.0 / n)
     depth = np.where(c > 0, row["zf"] - row["zs"], row["zs"] - row["zb"])
     y = row["ys"] * s**2 + np.where(c > 0, row["yf"], row["yb"]) * c**2
@@ -188,13 +183,11 @@ def nose_height(points: np.ndarray) -> np.ndarray:
     return np.maximum(z, floor)
 
 
-def lid_height(points: np.ndarray, *, radius: float = LID_RADIUS, width: float = 0.0016) -> np.ndarray:
+def lid_height(points: np.ndarray, *, width: float = 0.0016) -> np.ndarray:
     """z of the face where the lids lie on the eyeball [m]: the smooth maximum of the socket and a sphere."""
-    across2 = (np.abs(points[..., 0]) - EYE[0]) ** 2 + (points[..., 1] - EYE[1]) ** 2
-    sphere = np.where(
-        across2 < radius**2, EYE[2] + np.sqrt(np.maximum(radius**2 - across2, 0.0)), EYE[2] - 3.0 * (np.sqrt(across2) - radius)
-    )
-    return width * np.logaddexp(sphere / width, points[..., 2] / width)
+    across = np.hypot(np.abs(points[..., 0]) - EYE[0], points[..., 1] - EYE[1])
+    sphere = np.sqrt(np.maximum(LID_RADIUS**2 - across**2, 0.0)) - 3.0 * np.maximum(across - LID_RADIUS, 0.0)
+    return width * np.logaddexp((EYE[2] + sphere) / width, points[..., 2] / width)
 
 
 def mouth_opening(x: np.ndarray) -> np.ndarray:
@@ -210,48 +203,58 @@ def lip_height(x: np.ndarray, *, upper: np.ndarray) -> np.ndarray:
     return np.where(upper, 0.0072 * taper**0.75 * bow, 0.0092 * taper**0.65)
 
 
+def _close_mouth(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance from the mouth line and y [m] of points of the sheet after its mouth is closed."""
+    x, dy = points[..., 0], points[..., 1] - MOUTH_Y
+    distance, opening = np.abs(dy), mouth_opening(x)
+    from_line = np.maximum(distance - opening * (1.0 - smoothstep(opening, MOUTH_BLEND, distance)), 0.0)
+    near = 1.0 - smoothstep(0.0, MOUTH_BLEND, distance)
+    droop = 0.0012 * np.exp(-(((np.abs(x) - MOUTH_HALF_WIDTH) / 0.009) ** 2)) + 0.0006 * np.exp(-((x / 0.006) ** 2))
+    gap = LIP_GAP * np.clip(opening / MOUTH_HALF_HEIGHT, 0.0, 1.0)
+    return from_line, MOUTH_Y - droop * near + np.where(dy >= 0.0, 1.0, -1.0) * (from_line + gap)
+
+
 def _lips(points: np.ndarray) -> np.ndarray:
     """Close the sheet's mouth and raise the lips; ``points`` are on the sheet, shape [..., 3]."""
-    x, dy = points[..., 0], points[..., 1] - MOUTH_Y
-    upper, distance = dy >= 0.0, np.abs(dy)
-    opening = mouth_opening(x)
-    from_line = np.maximum(distance - opening * (1.0 - smoothstep(opening, MOUTH_BLEND, distance)), 0.0)
-    gap = LIP_GAP * np.clip(opening / MOUTH_HALF_HEIGHT, 0.0, 1.0)
-    near = 1.0 - smoothstep(0.0, MOUTH_BLEND, distance)
-    corner_droop = -0.0012 * np.exp(-(((np.abs(x) - MOUTH_HALF_WIDTH) / 0.009) ** 2)) * near
-    line = MOUTH_Y + 0.0006 * np.exp(-((x / 0.006) ** 2)) * near * -1.0 + corner_droop
+    x, upper = points[..., 0], points[..., 1] >= MOUTH_Y
+    from_line, y = _close_mouth(points)
     red = np.maximum(lip_height(x, upper=upper), 1e-4)
     across = from_line / red
     fullness = np.where(upper, 0.0034, 0.0046) * np.clip(red / np.where(upper, 0.0072, 0.0092), 0.0, 1.2)
-    bulge = fullness * np.where(across < 1.0, np.sqrt(np.clip(1.0 - (across - 0.45) ** 2 / 0.34, 0.0, 1.0)), 0.0)
-    skirt = fullness * 0.33 * np.exp(-np.maximum(across - 1.0, 0.0) * 1.6) * (across >= 1.0)
-    inside = -0.0035 * np.exp(-((from_line / 0.0016) ** 2)) * (opening > 0)
-    crease = -0.0028 * np.exp(-(((np.abs(x) - MOUTH_HALF_WIDTH - 0.001) / 0.0045) ** 2) - (from_line / 0.0050) ** 2)
-    philtrum = -0.0011 * np.exp(-((x / 0.0030) ** 2)) * smoothstep(0.007, 0.010, from_line) * upper
-    philtrum = philtrum * (1.0 - smoothstep(0.015, 0.020, from_line))
+    roll = np.sqrt(np.clip(1.0 - (across - 0.45) ** 2 / 0.34, 0.0, 1.0))
+    raised = fullness * np.where(across < 1.0, roll, 0.33 * np.exp(-1.6 * np.maximum(across - 1.0, 0.0)))
+    raised -= 0.0035 * np.exp(-((from_line / 0.0016) ** 2)) * (mouth_opening(x) > 0)  # turns inwards to the line
+    corner = (np.abs(x) - MOUTH_HALF_WIDTH - 0.001) / 0.0045
+    raised -= 0.0028 * np.exp(-(corner**2) - (from_line / 0.0050) ** 2)
+    philtrum = smoothstep(0.007, 0.010, from_line) * (1.0 - smoothstep(0.015, 0.020, from_line)) * upper
+    raised -= 0.0011 * np.exp(-((x / 0.0030) ** 2)) * philtrum
     out = points.copy()
-    out[..., 1] = line + np.where(upper, 1.0, -1.0) * (from_line + gap)
-    out[..., 2] += bulge + skirt + inside + crease + philtrum
+    out[..., 1] = y
+    out[..., 2] += raised
+    return out
+
+
+def _features(face: np.ndarray) -> np.ndarray:
+    """Lips, nose, lids and nostrils on points of the front of the head, shape [N, 3]."""
+    out = face.copy()
+    mouth = (np.abs(out[:, 1] - MOUTH_Y) < MOUTH_BLEND) & (np.abs(out[:, 0]) < 0.04)
+    out[mouth] = _lips(out[mouth])
+    nose = (np.abs(out[:, 0]) < 0.034) & (out[:, 1] < 0.034) & (out[:, 1] > -0.030)
+    height = nose_height(out[nose])
+    out[nose, 1] -= 0.16 * (height - out[nose, 2])  # the tip hangs: the nose has an underside
+    out[nose, 2] = height
+    eye = np.hypot(np.abs(out[:, 0]) - EYE[0], out[:, 1] - EYE[1]) < 0.03
+    out[eye, 2] = lid_height(out[eye])
+    centre, width, shift = (np.array(v) / 1000.0 for v in NOSTRIL_MM)
+    for side in (1.0, -1.0):
+        offset = (out - centre * [side, 1.0, 1.0]) / width
+        out += np.exp(-np.sum(offset**2, axis=1))[:, None] * shift
     return out
 
 
 def surface(angle: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The head's skin with all its features, shape [..., 3] [m]."""
+    """The head's skin with all its features, shape [N, 3] [m]."""
     points = bumps(base(angle, level))
-    sheet = base(angle, level)
-    face = np.cos(angle) > 0.2
-    f = points[face]
-    f[:, :2] = sheet[face][:, :2] + (f[:, :2] - sheet[face][:, :2]) * 1.0
-    near_mouth = (np.abs(sheet[face][:, 1] - MOUTH_Y) < MOUTH_BLEND) & (np.abs(f[:, 0]) < 0.04)
-    f[near_mouth] = _lips(f[near_mouth])
-    near_nose = (np.abs(f[:, 0]) < 0.034) & (f[:, 1] < 0.034) & (f[:, 1] > -0.030)
-    raised = nose_height(f[near_nose])
-    f[near_nose, 1] -= 0.16 * (raised - f[near_nose, 2])  # the tip hangs: the nose has an underside
-    f[near_nose, 2] = raised
-    f[:, 2] = np.where(np.linalg.norm(f[:, :2] - EYE[:2], axis=-1) < 0.03, lid_height(f), f[:, 2])
-    centre, width, shift = (np.array(v) / 1000.0 for v in NOSTRIL_MM)
-    for side in (1.0, -1.0):
-        mirror = np.array([side, 1.0, 1.0])
-        f += np.exp(-np.sum(((f - centre * mirror) / width) ** 2, axis=-1))[:, None] * shift
-    points[face] = f
+    front = np.cos(angle) > 0.2
+    points[front] = _features(points[front])
     return points

@@ -1,0 +1,182 @@
+"""Kernels of the blend shapes: both directions read every number of the directions once, and little else.
+
+At 5K vertices and 400 directions that is 24 MB a pass, so the time is that of the memory.
+"""
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from mgavatar.kernels.bridge import launch, launch_ranges
+from mgavatar.kernels.precision import Real, by_dtype
+
+_BLOCK = 2048  # numbers that one CPU item adds up, so that they stay in the first-level cache
+_LANES = 64  # partial sums of a dot product, the same on a CPU (vector lanes) and on CUDA (threads)
+
+# Four directions a pass: a sum is loaded and stored once for four products. Directions whose coefficient is exactly
+# zero are not read.
+_BLEND_SNIPPET = """
+    const long long n = out.shape[0];
+    const int n_dirs = coeffs.shape[0];
+    const long long begin = (long long)item * width;
+    const long long count = (begin + width < n ? begin + width : n) - begin;
+    const REAL* base = start.data + begin;
+    REAL* __restrict__ sums = out.data + begin;
+    for (long long i = 0; i < count; ++i)
+        sums[i] = base[i];
+    const REAL* d[4];
+    REAL c[4];
+    int filled = 0;
+    for (int k = 0; k < n_dirs; ++k) {
+        if (coeffs.data[k] != REAL(0)) {
+            c[filled] = coeffs.data[k];
+            d[filled] = dirs.data + k * n + begin;
+            ++filled;
+        }
+        if (filled == 4) {
+            const REAL c0 = c[0], c1 = c[1], c2 = c[2], c3 = c[3];
+            const REAL *__restrict__ d0 = d[0], *__restrict__ d1 = d[1];
+            const REAL *__restrict__ d2 = d[2], *__restrict__ d3 = d[3];
+            for (long long i = 0; i < count; ++i)
+                sums[i] += (c0 * d0[i] + c1 * d1[i]) + (c2 * d2[i] + c3 * d3[i]);
+            filled = 0;
+        }
+    }
+    for (int j = 0; j < filled; ++j)
+        for (long long i = 0; i < count; ++i)
+            sums[i] += c[j] * d[j][i];
+"""
+
+# Lane l of direction k adds up elements l, l + 64, ...: neighbouring lanes read neighbouring numbers on both devices.
+_DOT_SNIPPET = """
+    const long long n = grad.shape[0];
+    const REAL* d = dirs.data + (long long)k * n;
+    const REAL* g = grad.data;
+    REAL* sums = partial.data + (long long)k * LANES;
+    if (width == 1) {
+        REAL sum = 0;
+        for (long long i = lane; i < n; i += LANES)
+            sum += d[i] * g[i];
+        sums[lane] = sum;
+        return;
+    }
+    REAL lanes[LANES];
+    for (int l = 0; l < LANES; ++l)
+        lanes[l] = 0;
+    const long long whole = n - n % LANES;
+    for (long long i = 0; i < whole; i += LANES)
+        for (int l = 0; l < LANES; ++l)
+            lanes[l] += d[i + l] * g[i + l];
+    for (long long i = whole; i < n; ++i)
+        lanes[i - whole] += d[i] * g[i];
+    for (int l = 0; l < LANES; ++l)
+        sums[l] = lanes[l];
+"""
+
+
+def _kernels(real: Real) -> SimpleNamespace:
+    scalar = real.scalar
+    module = f"{__name__}.{real.name}"
+
+    def native(snippet: str) -> Any:
+        return wp.func_native(snippet.replace("REAL", real.c_name).replace("LANES", str(_LANES)))
+
+    @native(_BLEND_SNIPPET)
+    def add_directions(
+        item: int,
+        width: int,
+        dirs: wp.array2d(dtype=scalar),
+        coeffs: wp.array(dtype=scalar),
+        start: wp.array(dtype=scalar),
+        out: wp.array(dtype=scalar),
+    ) -> None: ...
+
+    @native(_DOT_SNIPPET)
+    def dot_direction(
+        k: int,
+        lane: int,
+        width: int,
+        dirs: wp.array2d(dtype=scalar),
+        grad: wp.array(dtype=scalar),
+        partial: wp.array2d(dtype=scalar),
+    ) -> None: ...
+
+    @wp.kernel(module=module, enable_backward=False)
+    def blend_kernel(
+        first: int,
+        # In:
+        width: int,  # numbers an item owns
+        dirs: wp.array2d(dtype=scalar),  # [K, 3V]
+        coeffs: wp.array(dtype=scalar),  # [K]
+        start: wp.array(dtype=scalar),  # [3V]
+        # Out:
+        out: wp.array(dtype=scalar),  # [3V]
+    ) -> None:
+        add_directions(first + wp.tid(), width, dirs, coeffs, start, out)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def blend_bwd_kernel(
+        first: int,
+        # In:
+        width: int,  # lanes an item owns, 1 or all
+        dirs: wp.array2d(dtype=scalar),  # [K, 3V]
+        grad: wp.array(dtype=scalar),  # [3V]
+        # Out:
+        partial: wp.array2d(dtype=scalar),  # [K, lanes]
+    ) -> None:
+        begin = (first + wp.tid()) * width
+        dot_direction(begin // wp.static(_LANES), begin % wp.static(_LANES), width, dirs, grad, partial)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def sum_kernel(
+        # In:
+        partial: wp.array2d(dtype=scalar),  # [M, N]
+        # Out:
+        out: wp.array(dtype=scalar),  # [M]
+    ) -> None:
+        m = wp.tid()
+        total = scalar(0.0)
+        for n in range(partial.shape[1]):
+            total += partial[m, n]
+        out[m] = total
+
+    return SimpleNamespace(blend=blend_kernel, blend_bwd=blend_bwd_kernel, sum=sum_kernel)
+
+
+_KERNELS = by_dtype(_kernels)
+
+
+class BlendShapes(torch.autograd.Function):
+    """``start + sum_k coeffs[k] dirs[k]`` as a node of torch's graph; :func:`mgavatar.kernels.lbs.blend_shapes` checks."""
+
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
+        ctx.save_for_backward(dirs)
+        out = torch.empty_like(start, memory_format=torch.contiguous_format)
+        width = 1 if start.is_cuda else _BLOCK
+        n_items = -(-start.numel() // width)
+        if n_items:
+            inputs = (width, dirs.reshape(len(dirs), start.numel()), coeffs, start.reshape(-1))
+            launch_ranges(_KERNELS[start.dtype].blend, n_items, inputs, (out.view(-1),))
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        (dirs,) = ctx.saved_tensors
+        if not ctx.needs_input_grad[2]:
+            return grad, None, None
+        kernels = _KERNELS[grad.dtype]
+        n_dirs = len(dirs)
+        partial = grad.new_zeros(n_dirs, _LANES)
+        grad_coeffs = grad.new_zeros(n_dirs)
+        width = 1 if grad.is_cuda else _LANES
+        if dirs.numel():
+            inputs = (width, dirs.reshape(n_dirs, -1), grad.reshape(-1))
+            launch_ranges(kernels.blend_bwd, n_dirs * _LANES // width, inputs, (partial,))
+            launch(kernels.sum, n_dirs, (partial,), (grad_coeffs,))
+        return grad, None, grad_coeffs
