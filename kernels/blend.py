@@ -151,7 +151,7 @@ _KERNELS = by_dtype(_kernels)
 
 
 class BlendShapes(torch.autograd.Function):
-    """``start + sum_k coeffs[k] dirs[k]`` as a node of torch's graph; :func:`mgavatar.kernels.lbs.blend_shapes` checks."""
+    """``start + sum_k coeffs[k] dirs[k]`` as a node of torch's graph; ``lbs.blend_shapes`` checks."""
 
     @staticmethod
     def forward(ctx: Any, start: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:

@@ -147,49 +147,14 @@ _POINTS_BWD = """
     }
 """
 
-# Adam (Kingma and Ba 2015) on the numbers whose gradient is not zero; the others keep value and moments.
-_ADAM = """
-#ifdef __CUDA_ARCH__
-    auto root = [](REAL x) { return sqrt(x); };
-#else
-    auto root = [](REAL x) { return ROOT(x); };  // wp::sqrt would not become a vector instruction
-#endif
-    for (long long i = begin; i < end;) {
-        const long long block = i / (FEATURES * BLOCK);
-        const long long stop = (block + 1) * (FEATURES * BLOCK) < end ? (block + 1) * (FEATURES * BLOCK) : end;
-        if (marks.data[block]) {
-            REAL* __restrict__ p = table.data;
-            REAL* __restrict__ g = grad.data;
-            REAL* __restrict__ m = means.data;
-            REAL* __restrict__ v = squares.data;
-            for (long long k = i; k < stop; ++k) {
-                const REAL now = g[k];
-                const bool hit = now != REAL(0);
-                const REAL mean = beta1 * m[k] + (REAL(1) - beta1) * now;
-                const REAL square = beta2 * v[k] + (REAL(1) - beta2) * now * now;
-                const REAL moved = p[k] - rate * mean / (root(square) * unbias + eps);
-                m[k] = hit ? mean : m[k];
-                v[k] = hit ? square : v[k];
-                p[k] = hit ? moved : p[k];
-                g[k] = REAL(0);
-            }
-        }
-        i = stop;
-    }
-"""
-
 
 def _kernels(real: Real, features: int) -> SimpleNamespace:
     scalar = real.scalar
     module = f"{__name__}.f{features}.{real.name}"
-    words = {
-        "FEATURES": str(features),
-        "BLOCK": str(BLOCK),
-        "ROOT": "__builtin_sqrt" if real.name == "float64" else "__builtin_sqrtf",
-    }
+    words = {"FEATURES": str(features), "BLOCK": str(BLOCK), "REAL": real.c_name}
 
     def native(snippet: str) -> Any:
-        for word, meaning in {**words, "REAL": real.c_name}.items():
+        for word, meaning in words.items():
             snippet = snippet.replace(word, meaning)
         return wp.func_native(snippet)
 
@@ -243,22 +208,6 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         grad: wp.array2d(dtype=scalar),
         levels: wp.array2d(dtype=int),
         grad_points: wp.array2d(dtype=scalar),
-    ) -> None: ...
-
-    @native(_ADAM)
-    def adam_range(
-        begin: wp.int64,
-        end: wp.int64,
-        rate: scalar,
-        unbias: scalar,
-        beta1: scalar,
-        beta2: scalar,
-        eps: scalar,
-        marks: wp.array(dtype=wp.uint8),
-        table: wp.array2d(dtype=scalar),
-        grad: wp.array2d(dtype=scalar),
-        means: wp.array2d(dtype=scalar),
-        squares: wp.array2d(dtype=scalar),
     ) -> None: ...
 
     @wp.kernel(module=module, enable_backward=False)
@@ -338,34 +287,12 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         for level in range(n_levels):
             add_point_gradient(level, n_levels, begin, end, points, table, grad, levels, grad_points)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def adam_kernel(
-        first: int,
-        # In:
-        width: int,  # numbers an item owns
-        rate: scalar,
-        unbias: scalar,
-        beta1: scalar,
-        beta2: scalar,
-        eps: scalar,
-        marks: wp.array(dtype=wp.uint8),  # [T / block]
-        # In and out:
-        table: wp.array2d(dtype=scalar),  # [T, F]
-        grad: wp.array2d(dtype=scalar),  # [T, F], left at zero
-        means: wp.array2d(dtype=scalar),  # [T, F]
-        squares: wp.array2d(dtype=scalar),  # [T, F]
-    ) -> None:
-        begin = wp.int64(first + wp.tid()) * wp.int64(width)
-        end = wp.min(begin + wp.int64(width), wp.int64(table.shape[0]) * wp.int64(table.shape[1]))
-        adam_range(begin, end, rate, unbias, beta1, beta2, eps, marks, table, grad, means, squares)
-
     return SimpleNamespace(
         encode=encode_kernel,
         table_bwd=table_bwd_kernel,
         table_fixed_bwd=table_fixed_bwd_kernel,
         from_fixed=from_fixed_kernel,
         points_bwd=points_bwd_kernel,
-        adam=adam_kernel,
     )
 
 
@@ -445,14 +372,14 @@ class HashEncode(torch.autograd.Function):
 
 
 def hash_encode(points: Tensor, table: Tensor, levels: Tensor) -> Tensor:
-    """Features of points, with an ordinary gradient for the whole table; :class:`~mgavatar.kernels.hash_grid.HashGrid` has a cheaper one.
+    """Features of points, with an ordinary gradient for the whole table; ``HashGrid`` has a cheaper one.
 
     Differentiable in ``points`` and ``table``.
 
     Args:
         points: Points, held inside the unit cube, shape [N, 3], float32 or float64.
         table: Entries of all levels, shape [T, F].
-        levels: :meth:`~mgavatar.kernels.hash_grid.HashGridShape.table_levels`, shape [L, 3], int32, on the device of ``table``.
+        levels: ``HashGridShape.table_levels``, shape [L, 3], int32, on the device of ``table``.
 
     Returns:
         Features, level by level, shape [N, L F].

@@ -2,14 +2,99 @@
 
 import math
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import torch
+import warp as wp
 from torch import Tensor, nn
 
 from mgavatar.kernels.bridge import launch_ranges
-from mgavatar.kernels.hash_encode import BLOCK, HashEncode, TableGradient, check_inputs, kernels_for
+from mgavatar.kernels.hash_encode import BLOCK, HashEncode, TableGradient, check_inputs
+from mgavatar.kernels.precision import Real, by_dtype
 
 _BLOCKS = 32  # blocks of one CPU item in the optimizer step
+
+
+# Adam (Kingma and Ba 2015) on the numbers whose gradient is not zero; the others keep value and moments.
+_ADAM = """
+    const long long per_block = (long long)features * BLOCK;
+#ifdef __CUDA_ARCH__
+    auto root = [](REAL x) { return sqrt(x); };
+#else
+    auto root = [](REAL x) { return ROOT(x); };  // wp::sqrt would not become a vector instruction
+#endif
+    for (long long i = begin; i < end;) {
+        const long long block = i / per_block;
+        const long long stop = (block + 1) * per_block < end ? (block + 1) * per_block : end;
+        if (marks.data[block]) {
+            REAL* __restrict__ p = table.data;
+            REAL* __restrict__ g = grad.data;
+            REAL* __restrict__ m = means.data;
+            REAL* __restrict__ v = squares.data;
+            for (long long k = i; k < stop; ++k) {
+                const REAL now = g[k];
+                const bool hit = now != REAL(0);
+                const REAL mean = beta1 * m[k] + (REAL(1) - beta1) * now;
+                const REAL square = beta2 * v[k] + (REAL(1) - beta2) * now * now;
+                const REAL moved = p[k] - rate * mean / (root(square) * unbias + eps);
+                m[k] = hit ? mean : m[k];
+                v[k] = hit ? square : v[k];
+                p[k] = hit ? moved : p[k];
+                g[k] = REAL(0);
+            }
+        }
+        i = stop;
+    }
+"""
+
+
+def _kernels(real: Real) -> SimpleNamespace:
+    scalar = real.scalar
+    root = "__builtin_sqrt" if real.name == "float64" else "__builtin_sqrtf"
+
+    @wp.func_native(_ADAM.replace("REAL", real.c_name).replace("ROOT", root).replace("BLOCK", str(BLOCK)))
+    def adam_range(
+        begin: wp.int64,
+        end: wp.int64,
+        features: int,
+        rate: scalar,
+        unbias: scalar,
+        beta1: scalar,
+        beta2: scalar,
+        eps: scalar,
+        marks: wp.array(dtype=wp.uint8),
+        table: wp.array2d(dtype=scalar),
+        grad: wp.array2d(dtype=scalar),
+        means: wp.array2d(dtype=scalar),
+        squares: wp.array2d(dtype=scalar),
+    ) -> None: ...
+
+    @wp.kernel(module=f"{__name__}.{real.name}", enable_backward=False)
+    def adam_kernel(
+        first: int,
+        # In:
+        width: int,  # numbers an item owns
+        rate: scalar,
+        unbias: scalar,
+        beta1: scalar,
+        beta2: scalar,
+        eps: scalar,
+        marks: wp.array(dtype=wp.uint8),  # [T / block]
+        # In and out:
+        table: wp.array2d(dtype=scalar),  # [T, F]
+        grad: wp.array2d(dtype=scalar),  # [T, F], left at zero
+        means: wp.array2d(dtype=scalar),  # [T, F]
+        squares: wp.array2d(dtype=scalar),  # [T, F]
+    ) -> None:
+        features = table.shape[1]
+        begin = wp.int64(first + wp.tid()) * wp.int64(width)
+        end = wp.min(begin + wp.int64(width), wp.int64(table.shape[0]) * wp.int64(features))
+        adam_range(begin, end, features, rate, unbias, beta1, beta2, eps, marks, table, grad, means, squares)
+
+    return SimpleNamespace(adam=adam_kernel)
+
+
+_KERNELS = by_dtype(_kernels)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,13 +201,12 @@ class HashGrid(nn.Module):
             eps: Added to the root of the second moment.
         """
         self._step += 1
-        kernels = kernels_for(self.shape.features)[self.table.dtype]
         rate = lr / (1.0 - betas[0] ** self._step)
         unbias = 1.0 / math.sqrt(1.0 - betas[1] ** self._step)
         width = 1 if self.table.is_cuda else BLOCK * _BLOCKS * self.shape.features
         inputs = (width, rate, unbias, *betas, eps, self._marks)
         outputs = (self.table.data, self._gradient, self.exp_avg, self.exp_avg_sq)
-        launch_ranges(kernels.adam, -(-self.table.numel() // width), inputs, outputs)
+        launch_ranges(_KERNELS[self.table.dtype].adam, -(-self.table.numel() // width), inputs, outputs)
         self._marks.zero_()
         torch.autograd.graph.increment_version(self.table)
 

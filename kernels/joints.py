@@ -147,7 +147,7 @@ def _joints_bwd_kernel(
 
 
 class JointTransforms(torch.autograd.Function):
-    """The chain as a node of torch's graph; :func:`mgavatar.kernels.lbs.joint_transforms` checks."""
+    """The chain as a node of torch's graph; ``lbs.joint_transforms`` checks."""
 
     @staticmethod
     def forward(ctx: Any, joints: Tensor, poses: Tensor, parents: Tensor) -> Any:

@@ -266,8 +266,11 @@ def mix3(values: wp.array[wp.vec3], corners: wp.vec3i, weights: wp.vec3) -> wp.v
 @wp.func
 def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3) -> float:
     """1 where nothing stands between the point and the key light; a hard shadow, softened by the pixel's samples."""
-    hit = wp.mesh_query_ray(mesh, point + 0.002 * normal + 0.001 * light, light, FAR)
-    return wp.where(hit.result, 0.25, 1.0)
+    if wp.dot(normal, light) <= 0.0 or wp.mesh_query_ray_anyhit(
+        mesh, point + 0.002 * normal + 0.001 * light, light, 0.5
+    ):
+        return 0.25
+    return 1.0
 
 
 @wp.func
@@ -303,9 +306,7 @@ def shade(
         normal = wp.normalize(normal - 1.05 * wp.dot(normal, view) * view)
     sky = 0.5 + 0.5 * normal[1]
     total = wp.cw_mul(color, wp.lerp(wp.vec3(0.20, 0.18, 0.17), wp.vec3(0.46, 0.48, 0.53), sky)) * marks[2]
-    shadow = wp.float32(1.0)
-    if wp.dot(normal_in, light_direction(0)) > -wrap:
-        shadow = lit(mesh, point, normal_in, light_direction(0))
+    shadow = lit(mesh, point, normal_in, light_direction(0))
     for i in range(3):
         light = light_direction(i)
         reach = (0.35 + 0.65 * marks[2]) * wp.where(i == 0, shadow, 1.0)

@@ -317,7 +317,7 @@ def whole_file(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-@settings(max_examples=3000, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged_npz_raises_data_errors(tmp_path, whole_file, data):
     seed = bytearray(whole_file)

@@ -285,10 +285,19 @@ def test_expression_pairs_mirror_each_other_and_keep_their_side(head: HeadModel)
 
 @pytest.mark.parametrize(
     ("name", "region", "axis", "sign"),
-    [("smile_L", "lips", 1, 1), ("frown_L", "lips", 1, -1), ("pucker", "lips", 2, 1), ("jaw_open", "lower_teeth", 1, -1),
-     ("brow_inner_up_L", "face", 1, 1), ("brow_down_L", "face", 1, -1), ("mouth_left", "lips", 0, 1),
-     ("nose_sneer_L", "nose", 1, 1), ("upper_lip_raise_L", "lips", 1, 1), ("lower_lip_depress_L", "lips", 1, -1)],
-)  # fmt: skip
+    [
+        ("smile_L", "lips", 1, 1),
+        ("frown_L", "lips", 1, -1),
+        ("pucker", "lips", 2, 1),
+        ("jaw_open", "lower_teeth", 1, -1),
+        ("brow_inner_up_L", "face", 1, 1),
+        ("brow_down_L", "face", 1, -1),
+        ("mouth_left", "lips", 0, 1),
+        ("nose_sneer_L", "nose", 1, 1),
+        ("upper_lip_raise_L", "lips", 1, 1),
+        ("lower_lip_depress_L", "lips", 1, -1),
+    ],
+)
 def test_expressions_move_what_they_name(head: HeadModel, name: str, region: str, axis: int, sign: int) -> None:
     moved = (shaped(head, **{name: 1.0}) - head.v_template)[head.masks[region]]
     strongest = moved[np.argmax(np.abs(moved[:, axis])), axis]

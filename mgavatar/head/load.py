@@ -45,27 +45,32 @@ def load_head_model(path: Path) -> HeadModel:
     raise DataError(f"{path}: a head model is a .npz with FLAME's keys or a FLAME .pkl")
 
 
-def save_head_model(path: Path, model: HeadModel) -> None:
-    """Write a head model as the ``.npz`` that ``load_head_model`` reads."""
+def head_arrays(model: HeadModel) -> dict[str, np.ndarray]:
+    """A head model as the arrays of its ``.npz`` file."""
     arrays = {
         "v_template": model.v_template,
         "f": model.faces,
         "shapedirs": model.shapedirs,
-        "n_shape": np.int64(model.n_shape),
-        "n_expr": np.int64(model.n_expr),
+        "n_shape": np.asarray(model.n_shape, np.int64),
+        "n_expr": np.asarray(model.n_expr, np.int64),
         "posedirs": model.posedirs,
         "J_regressor": model.J_regressor,
         "weights": model.lbs_weights,
         "kintree_table": np.stack([model.parents, np.arange(len(model.parents))]).astype(np.int64),
         "vt": model.vt,
         "ft": model.ft,
-        "expr_basis": np.str_(model.expr_basis),
+        "expr_basis": np.asarray(model.expr_basis),
         **{f"mask_{name}": mask for name, mask in model.masks.items()},
     }
     if model.expr_names:
         arrays["expr_names"] = np.array(model.expr_names)
+    return arrays
+
+
+def save_head_model(path: Path, model: HeadModel) -> None:
+    """Write a head model as the ``.npz`` that ``load_head_model`` reads."""
     with atomic_write(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(file, allow_pickle=False, **head_arrays(model))  # type: ignore[arg-type]
 
 
 def _basis_of_names(*names: str) -> str:
@@ -82,6 +87,15 @@ def _basis_of_names(*names: str) -> str:
 def _from_npz(path: Path) -> HeadModel:
     known = {*RIG_KEYS, *UV_KEYS, "n_shape", "n_expr", "expr_names", "expr_basis"}
     arrays = read_npz(path, wanted=lambda key: key in known or key.startswith("mask_"), max_bytes=MAX_ARRAYS).arrays
+    return head_from_arrays(arrays, path=path)
+
+
+def head_from_arrays(arrays: dict[str, np.ndarray], *, path: Path) -> HeadModel:
+    """A head model from the arrays of its ``.npz`` file, checked; ``path`` is for messages.
+
+    Raises:
+        DataError: If something is missing, misshapen, not finite or out of range.
+    """
     if not any(key in arrays for key in RIG_KEYS):
         raise DataError(f"{path}: not a head model: it has none of {', '.join(RIG_KEYS)}")
     if any(key not in arrays for key in UV_KEYS):

@@ -66,9 +66,9 @@ def ear_rings(
     centre = np.array([EAR_ANGLE * around, float(q_of_level(EAR_LEVEL))])
     # On the sheet p grows to the back of the left half: counter-clockwise from outside is up, then forwards.
     t = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
-    scale = np.linspace(1.0, 0.12, len(RINGS))
-    sheet = [centre + s * np.stack([RINGS[0, 0] * HALF_WIDTH * np.cos(t) * (1 + 0.09 * np.sin(t)) + LEAN * RINGS[0, 0] * HALF_HEIGHT * np.sin(t),
-                                    RINGS[0, 0] * HALF_HEIGHT * np.sin(t)], axis=1) for s in scale]  # fmt: skip
+    back, up = HALF_WIDTH * np.cos(t) * (1.0 + 0.09 * np.sin(t)), HALF_HEIGHT * np.sin(t)
+    ellipse = RINGS[0, 0] * np.stack([back + LEAN * up, up], axis=1)
+    sheet = [centre + scale * ellipse for scale in np.linspace(1.0, 0.12, len(RINGS))]
     verts = [_ring(skin, centre, row, t) for row in RINGS]
     middle = skin(centre[None] + [[0.0008, -0.002]]) - [0.0025, 0.0, 0.0]
     return [*sheet, centre[None]], [*verts, middle]

@@ -33,42 +33,51 @@ class Pull(NamedTuple):
 
 
 # Left halves of mirrored pairs: name_L is as written, name_R its mirror image.
-PAIRS: tuple[tuple[str, tuple[Pull, ...]], ...] = (
-    (
-        "smile",
-        (
-            Pull((25, -46), (15, 13), (5.5, 6.5, -4)),
-            Pull((36, -14), (15, 13), (1, 3, 2.5)),
-            Pull((10, -47), (9, 10), (1, 0.5, -1)),
-        ),
+PAIRS: dict[str, tuple[Pull, ...]] = {
+    "smile": (
+        Pull((25, -46), (12, 12), (5.5, 6.5, -4)),
+        Pull((36, -14), (15, 13), (1, 3, 2.5)),
+        Pull((10, -47), (9, 10), (1, 0.8, -1)),
     ),
-    ("frown", (Pull((25, -49), (12, 11), (0.5, -7, -1)), Pull((18, -64), (12, 10), (0, -2, 0.5)))),
-    ("upper_lip_raise", (Pull((11, -40), (10, 9), (0, 5.5, 1), "upper"), Pull((16, -22), (9, 9), (0, 2, 0.8)))),
-    ("lower_lip_depress", (Pull((11, -55), (10, 9), (0, -5.5, 0.5), "lower"),)),
-    ("dimple", (Pull((28, -47), (9, 10), (3, 0.5, -4.5)),)),
-    ("lip_stretch", (Pull((27, -50), (14, 13), (6.5, -1.5, -3.5)),)),
-    ("brow_down", (Pull((22, 42), (15, 9), (-2.5, -5.5, 0.5)),)),
-    ("brow_inner_up", (Pull((13, 46), (11, 12), (0.5, 6.5, 0.5)),)),
-    ("brow_outer_up", (Pull((42, 45), (14, 12), (0, 6.5, -0.5)),)),
-    ("cheek_puff", (Pull((38, -42), (15, 16), (6, 0, 6)), Pull((20, -46), (12, 12), (0, 0, 2.5)))),
-    ("cheek_suck", (Pull((40, -36), (13, 15), (-5, 0, -4)),)),
-    ("cheek_raise", (Pull((38, 0), (14, 10), (0, 4, 2.5)),)),
-    ("nose_sneer", (Pull((13, -12), (7, 12), (0.5, 4.5, 0.5)), Pull((12, -38), (9, 8), (0, 2.5, 0.5), "upper"))),
-    ("nostril_flare", (Pull((14, -18), (6, 6), (2.2, 0.3, 0.3)),)),
-    ("jaw_clench", (Pull((54, -56), (14, 16), (3, 0, 0.5)),)),
-)
+    "frown": (Pull((25, -49), (12, 11), (0.5, -7, -1)), Pull((18, -64), (12, 10), (0, -2, 0.5))),
+    "upper_lip_raise": (Pull((11, -40), (10, 9), (0, 5.5, 1), "upper"), Pull((16, -22), (9, 9), (0, 2, 0.8))),
+    "lower_lip_depress": (Pull((11, -55), (10, 9), (0, -5.5, 0.5), "lower"),),
+    "dimple": (Pull((28, -47), (9, 10), (3, 0.5, -4.5)),),
+    "lip_stretch": (Pull((27, -50), (14, 13), (6.5, -1.5, -3.5)),),
+    "brow_down": (Pull((22, 42), (15, 9), (-2.5, -5.5, 0.5)),),
+    "brow_inner_up": (Pull((13, 46), (11, 12), (0.5, 6.5, 0.5)),),
+    "brow_outer_up": (Pull((42, 45), (14, 12), (0, 6.5, -0.5)),),
+    "cheek_puff": (Pull((38, -42), (15, 16), (6, 0, 6)), Pull((20, -46), (12, 12), (0, 0, 2.5))),
+    "cheek_suck": (Pull((40, -36), (13, 15), (-5, 0, -4)),),
+    "cheek_raise": (Pull((38, 0), (14, 10), (0, 4, 2.5)),),
+    "nose_sneer": (Pull((13, -12), (7, 12), (0.5, 4.5, 0.5)), Pull((12, -38), (9, 8), (0, 2.5, 0.5), "upper")),
+    "nostril_flare": (Pull((14, -18), (6, 6), (2.2, 0.3, 0.3)),),
+    "jaw_clench": (Pull((50, -56), (14, 16), (3, 0, 0.5)),),
+}
 
 # Both sides at once.
-CENTRED: tuple[tuple[str, tuple[Pull, ...]], ...] = (
-    ("pucker", (Pull((24, -47), (12, 14), (-8.5, 0, 3.5)), Pull((-24, -47), (12, 14), (8.5, 0, 3.5)), Pull((0, -47), (17, 13), (0, 0, 6)))),
-    ("funnel", (Pull((23, -47), (12, 14), (-6, 0, 3)), Pull((-23, -47), (12, 14), (6, 0, 3)), Pull((0, -40), (15, 9), (0, 4, 6), "upper"), Pull((0, -54), (15, 9), (0, -4.5, 6), "lower"))),
-    ("lip_press", (Pull((0, -40), (22, 7), (0, -1.0, -3), "upper"), Pull((0, -54), (22, 7), (0, 1.4, -3), "lower"))),
-    ("upper_lip_roll", (Pull((0, -42), (20, 6), (0, -1.2, -4), "upper"),)),
-    ("lower_lip_roll", (Pull((0, -52), (20, 6), (0, 1.4, -4), "lower"),)),
-    ("mouth_left", (Pull((0, -47), (30, 16), (8, 0, 0)),)),
-    ("mouth_right", (Pull((0, -47), (30, 16), (-8, 0, 0)),)),
-    ("chin_raise", (Pull((0, -76), (18, 12), (0, 4.5, 1)), Pull((0, -56), (18, 8), (0, 1.2, 1.5), "lower"))),
-)  # fmt: skip
+CENTRED: dict[str, tuple[Pull, ...]] = {
+    "pucker": (
+        Pull((24, -47), (12, 14), (-8.5, 0, 3.5)),
+        Pull((-24, -47), (12, 14), (8.5, 0, 3.5)),
+        Pull((0, -47), (17, 13), (0, 0, 6)),
+    ),
+    "funnel": (
+        Pull((23, -47), (12, 14), (-6, 0, 3)),
+        Pull((-23, -47), (12, 14), (6, 0, 3)),
+        Pull((0, -40), (15, 9), (0, 4, 6), "upper"),
+        Pull((0, -54), (15, 9), (0, -4.5, 6), "lower"),
+    ),
+    "lip_press": (
+        Pull((0, -40), (22, 7), (0, -1.0, -3), "upper"),
+        Pull((0, -54), (22, 7), (0, 1.4, -3), "lower"),
+    ),
+    "upper_lip_roll": (Pull((0, -42), (20, 6), (0, -1.2, -4), "upper"),),
+    "lower_lip_roll": (Pull((0, -52), (20, 6), (0, 1.4, -4), "lower"),),
+    "mouth_left": (Pull((0, -47), (30, 16), (8, 0, 0)),),
+    "mouth_right": (Pull((0, -47), (30, 16), (-8, 0, 0)),),
+    "chin_raise": (Pull((0, -76), (18, 12), (0, 4.5, 1)), Pull((0, -56), (18, 8), (0, 1.2, 1.5), "lower")),
+}
 
 
 def _details() -> list[tuple[str, tuple[Pull, ...]]]:
@@ -179,14 +188,14 @@ def expression_directions(mesh: HeadMesh, jaw: Array) -> tuple[Array, tuple[str,
     def add_pair(name: str, left: Array) -> None:
         named.extend([(f"{name}_L", left), (f"{name}_R", face.mirrored(left))])
 
-    for name, pulls in PAIRS:
+    for name, pulls in PAIRS.items():
         add_pair(name, face.pulls(pulls) * face.left())
     add_pair("blink", lid_direction(mesh, upper=1.0, lower=1.0))
     add_pair("wide", lid_direction(mesh, upper=-0.32, lower=-0.25))
     squint = lid_direction(mesh, upper=0.22, lower=0.75)
     add_pair("squint", squint + face.pulls((Pull((34, 5), (14, 8), (0, 1.8, 1.2)),)) * face.left())
     add_pair("upper_lid_up", lid_direction(mesh, upper=-0.30, lower=0.0))
-    named.extend((name, face.pulls(pulls)) for name, pulls in CENTRED)
+    named.extend((name, face.pulls(pulls)) for name, pulls in CENTRED.items())
     named.extend(jaw_directions(mesh, jaw))
     for name, pulls in _details():
         add_pair(name, face.pulls(pulls) * face.left())

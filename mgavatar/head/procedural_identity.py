@@ -23,7 +23,7 @@ def _spread(scale: tuple[float, float, float]) -> Field:
 
 
 def _within(field: Field, y: tuple[float, float, float, float]) -> Field:
-    """``field`` between four heights [mm]: rising from the first to the second, falling from the third to the fourth."""
+    """``field`` between heights [mm]: rising from the first to the second, falling from the third to the fourth."""
     a, b, c, d = (v / 1000.0 for v in y)
     return lambda p: field(p) * (smoothstep(a, b, p[:, 1]) * (1.0 - smoothstep(c, d, p[:, 1])))[:, None]
 
@@ -59,7 +59,13 @@ def _skew(shift: tuple[float, float, float], axis: int, width: float) -> Field:
 NAMED: tuple[tuple[str, Field], ...] = (
     ("size", _spread((1, 1, 1))),
     ("head_width", _within(_spread((1, 0, 0)), (-120, -80, 300, 301))),
-    ("face_length", _sum(_within(_spread((0, 1, 0)), (-150, -100, 300, 301)), _bell((0, -85, 20), (60, 30, 60), (0, -0.03, 0)))),
+    (
+        "face_length",
+        _sum(
+            _within(_spread((0, 1, 0)), (-150, -100, 300, 301)),
+            _bell((0, -85, 20), (60, 30, 60), (0, -0.03, 0)),
+        ),
+    ),
     ("depth", _within(_spread((0, 0, 1)), (-120, -80, 300, 301))),
     ("jaw_width", _within(_spread((1, 0, 0)), (-115, -85, -55, 0))),
     ("face_width", _front(_within(_spread((1, 0, 0)), (-80, -40, 30, 60)))),

@@ -6,6 +6,7 @@ Only the left half is made, piece by piece, in a :class:`HalfMesh`; :func:`build
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,6 @@ from mgavatar.head.procedural_sheet import (
     AROUND,
     N_EAR,
     N_LID,
-    N_LIP,
     P_BACK,
     fill,
     front_to_sheet,
@@ -25,6 +25,7 @@ from mgavatar.head.procedural_sheet import (
     levels,
     lid_rings,
     lip_rings,
+    nose_lines,
     ring_stack,
     sheet_to_angles,
     skin,
@@ -113,58 +114,62 @@ def _main_uv(sheet: Array) -> Array:
     return np.stack([0.5 + (0.5 - GUTTER) * u, 0.29 + (0.71 - GUTTER) * v], axis=1)
 
 
-def _add_skin(half: HalfMesh) -> None:
+def _outline(rings: dict[str, list[Array]]) -> dict[str, Array]:
+    """The fixed points of the skin's sheet, piece by piece: its four sides, then the outermost rings."""
     _, _, q_cap, q_rim = levels()
-    lids, lips = ([front_to_sheet(r) for r in rings] for rings in (lid_rings(), lip_rings()))
-    lips = [np.where(np.isin(np.arange(N_LIP), (0, N_LIP - 1))[:, None], r * [0.0, 1.0], r) for r in lips]
-    ear_sheet, ear_verts = ear_rings(skin, n=N_EAR, around=AROUND, q_of_level=levels()[0])
     corners = np.array([[0.0, q_rim], [P_BACK, q_rim], [P_BACK, q_cap], [0.0, q_cap]])
-    front = [graded_line(corners[3], lips[0][-1]), graded_line(lips[0][0], corners[0])]
-    sides = [
-        graded_line(a, b) for a, b in ((corners[0], corners[1]), (corners[1], corners[2]), (corners[2], corners[3]))
-    ]
-    fixed = np.concatenate([corners, *front, *sides, lips[0], lids[0], ear_sheet[0]])
-    filler, triangles = fill(
-        fixed, [lips[0], lids[0], ear_sheet[0]], hexagons(corners[0], corners[2], 0.0016),
-        lambda s: form.surface(*sheet_to_angles(s)),
-    )  # fmt: skip
-    n_before = len(corners) + sum(map(len, front)) + sum(map(len, sides))
-    starts = np.cumsum([n_before, N_LIP, N_LID, N_EAR])
-    outer = [np.arange(a, b) for a, b in zip(starts[:-1], starts[1:], strict=True)]
-    sheet, verts, groups = [filler], [skin(filler)], {}
-    tris, count = [triangles], len(filler)
-    for name, ring, rings, closed in zip(
-        ("lip", "lid", "ear"), outer, (lips, lids, ear_sheet), (False, True, True), strict=True
-    ):
-        ids = [ring]
-        for k in range(1, len(rings)):
-            ids.append(np.arange(count, count + len(rings[k])))
-            sheet.append(rings[k])
-            verts.append(ear_verts[k] if name == "ear" else skin(rings[k]))
-            count += len(rings[k])
-        tris.append(ring_stack(ids if len(rings[-1]) > 1 else ids[:-1], closed=closed))
-        if len(rings[-1]) == 1:
-            tris.append(_fan(ids[-2], ids[-1][0]))
-        groups.update({f"{name}_{len(ids) - 1 - k}": v for k, v in enumerate(ids)})
-    all_sheet, all_verts = np.concatenate(sheet), np.concatenate(verts)
-    all_verts[all_sheet[:, 0] == 0.0, 0] = 0.0
-    all_verts[all_sheet[:, 0] == P_BACK, 0] = 0.0
-    ids = half.add_points(all_verts, part="skin", sheet=all_sheet)
-    vt = half.add_vt(_main_uv(all_sheet), axis=0.5)
-    half.add_faces(np.concatenate(tris), ids, vt)
-    half.groups.update(groups)
-    n_sides = np.cumsum([len(corners) + sum(map(len, front)), *map(len, sides)])
-    half.groups["rim"] = np.concatenate([[0], np.arange(n_sides[0], n_sides[1]), [1]])
-    half.groups["cap_edge"] = np.concatenate([[2], np.arange(n_sides[2], n_sides[3]), [3]])
+    return {
+        "corners": corners,
+        "above_mouth": graded_line(corners[3], rings["lip"][0][-1]),
+        "below_mouth": graded_line(rings["lip"][0][0], corners[0]),
+        "bottom": graded_line(corners[0], corners[1]),
+        "back": graded_line(corners[1], corners[2]),
+        "top": graded_line(corners[2], corners[3]),
+        **{name: stack[0] for name, stack in rings.items()},
+        "nose": front_to_sheet(np.concatenate(nose_lines())),
+    }
 
 
-def _fan(ring: Array, centre: int) -> Array:
-    return np.stack([ring, np.roll(ring, -1), np.full_like(ring, centre)], axis=1)
+def _numbered(pieces: dict[Any, Array]) -> dict[Any, Array]:
+    """Consecutive ids for the points of each piece."""
+    ends = np.cumsum([len(piece) for piece in pieces.values()])
+    return {name: np.arange(end - len(pieces[name]), end) for name, end in zip(pieces, ends, strict=True)}
+
+
+def _add_skin(half: HalfMesh) -> None:
+    """The skin below the cap, with the rings of mouth, lids and ear."""
+    lips = [front_to_sheet(ring) for ring in lip_rings()]
+    for ring in lips:
+        ring[[0, -1], 0] = 0.0  # exactly on the middle: there the halves are welded
+    ear_sheet, ear_verts = ear_rings(skin, n=N_EAR, around=AROUND, q_of_level=levels()[0])
+    rings = {"lip": lips, "lid": [front_to_sheet(ring) for ring in lid_rings()], "ear": ear_sheet}
+    outline = _outline(rings)
+    ids = _numbered(outline)
+    low, high = outline["corners"][[0, 2]]
+    holes = [stack[0] for stack in rings.values()]
+    filler, triangles = fill(np.concatenate(list(outline.values())), holes, hexagons(low, high, 0.0016), skin)
+    sheets, verts, faces = [filler], [skin(filler)], [triangles]
+    for name, stack in rings.items():
+        inner = [r + sum(map(len, sheets)) for r in _numbered(dict(enumerate(stack[1:]))).values()]
+        sheets.extend(stack[1:])
+        verts.extend(ear_verts[1:] if name == "ear" else map(skin, stack[1:]))
+        faces.append(ring_stack([ids[name], *inner], closed=name != "lip"))
+        half.groups.update({f"{name}_{k}": r for k, r in enumerate([ids[name], *inner][::-1])})
+    sheet, points = np.concatenate(sheets), np.concatenate(verts)
+    points[(sheet[:, 0] == 0.0) | (sheet[:, 0] == P_BACK), 0] = 0.0
+    half.add_faces(
+        np.concatenate(faces),
+        half.add_points(points, part="skin", sheet=sheet),
+        half.add_vt(_main_uv(sheet), axis=0.5),
+    )
+    corner = ids["corners"]
+    half.groups["rim"] = np.concatenate([corner[:1], ids["bottom"], corner[1:2]])
+    half.groups["cap_edge"] = np.concatenate([corner[2:3], ids["top"], corner[3:]])
 
 
 def _add_cap(half: HalfMesh) -> None:
     """The top of the skull, triangulated in a polar plane whose outline is the sheet's upper edge."""
-    to_q, to_level, q_cap, _ = levels()
+    _, to_level, q_cap, _ = levels()
     edge = half.groups["cap_edge"]
     angle = np.concatenate(half.sheet)[edge, 0] / AROUND
     rim = -q_cap * np.stack([np.sin(angle), -np.cos(angle)], axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -59,8 +60,8 @@ def spacing(points: Array) -> Array:
     face = np.hypot(np.hypot(x / 1.0, (y + 0.018) / 1.25), np.minimum(z - 0.035, 0.0) / 0.9)
     coarse = 0.0039 + 0.0064 * form.smoothstep(0.035, 0.115, face)
     nose = np.exp(-((x / 0.016) ** 2) - ((y + 0.013) / 0.021) ** 2)
-    chin = np.exp(-((x / 0.040) ** 2) - ((y + 0.092) / 0.014) ** 2) * (z > 0.0)
-    return coarse * (1.0 - 0.55 * nose - 0.25 * chin)
+    chin = np.exp(-((x / 0.040) ** 2) - ((y + 0.092) / 0.016) ** 2) * (z > 0.0)
+    return coarse * (1.0 - 0.55 * nose - 0.40 * chin)
 
 
 def strip(outer: Array, inner: Array, *, closed: bool) -> Array:
@@ -73,8 +74,12 @@ def strip(outer: Array, inner: Array, *, closed: bool) -> Array:
 
 
 def ring_stack(rings: list[Array], *, closed: bool) -> Array:
-    """Triangles of a stack of rings, given as local ids from outside to inside."""
-    return np.concatenate([strip(a, b, closed=closed) for a, b in zip(rings[:-1], rings[1:], strict=True)])
+    """Triangles of a stack of rings, given as ids from outside to inside; the last may be a single point."""
+    faces = [strip(a, b, closed=closed) for a, b in pairwise(rings) if len(b) > 1]
+    if len(rings[-1]) == 1:
+        ring = rings[-2]
+        faces.append(np.stack([ring, np.roll(ring, -1), np.full_like(ring, rings[-1][0])], axis=1))
+    return np.concatenate(faces)
 
 
 def lid_rings() -> list[Array]:
@@ -86,6 +91,18 @@ def lid_rings() -> list[Array]:
     edge = np.stack([form.EYE[0] - 0.0006 + 0.0145 * c, form.EYE[1] + edge_height + tilt], axis=1)
     outer = np.stack([form.EYE[0] + 0.0005 + 0.0198 * c, form.EYE[1] + 0.0010 + 0.0158 * s], axis=1)
     return [edge + f * (outer - edge) for f in (1.0, 0.74, 0.50, 0.29, 0.12, 0.0)]
+
+
+def nose_lines() -> list[Array]:
+    """Lines on the sheet along the foot and the crest of the nose's underside, where the skin bends sharply."""
+    lines = []
+    for offset in (-0.0010, 0.0002, 0.0014):
+        radius = 0.0063 + offset
+        t = np.linspace(-np.pi / 2, 0.75, 8)
+        wing = np.stack([0.0113 + radius * np.cos(t), -0.0172 + radius * np.sin(t)], axis=1)
+        x = np.array([0.0022, 0.0044, 0.0067, 0.0090])
+        lines.append(np.concatenate([np.stack([x, np.full_like(x, -0.0172 - radius)], axis=1), wing]))
+    return lines
 
 
 def _lip_border(t: Array) -> Array:

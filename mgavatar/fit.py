@@ -1,0 +1,276 @@
+"""From a capture to an avatar: the paper's two stages, one after the other."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mgavatar.appearance.stage import AppearanceStage
+from mgavatar.avatar import Avatar, CaptureInfo, build_appearance
+from mgavatar.camera import Camera
+from mgavatar.capture.images import read_images
+from mgavatar.capture.subject import Subject
+from mgavatar.config import FitConfig, to_toml
+from mgavatar.errors import DataError
+from mgavatar.files import atomic_write, existing_file
+from mgavatar.geometry.head import PersonalHead
+from mgavatar.geometry.stage import GeometryStage, VertexGaussians
+from mgavatar.head.body import Body
+from mgavatar.head.model import HeadModel
+from mgavatar.progress import MetricsLog, Reporter
+
+
+class Stage(Protocol):
+    """What the loop needs of a stage."""
+
+    name: str
+    iterations: int
+
+    def step(self, camera: Camera, timestep: int, target: Tensor, background: Tensor) -> dict[str, float]: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Training images in memory, as bytes.
+
+    Attributes:
+        images: Shape [N, 3, H, W], uint8, on the CPU.
+        cameras: N cameras at the size of ``images``.
+        timesteps: N rows of the capture's parameters.
+    """
+
+    images: Tensor
+    cameras: list[Camera]
+    timesteps: list[int]
+
+    @staticmethod
+    def of(subject: Subject, scale: float) -> Views:
+        """Decode the training split, reduced to ``scale`` of its size."""
+        frames = subject.frames["train"]
+        first = frames[0].camera
+        size = (max(1, round(first.width * scale)), max(1, round(first.height * scale)))
+        cameras = [frame.camera.scaled(*size) for frame in frames]
+        return Views(read_images(frames, size=size), cameras, [frame.timestep for frame in frames])
+
+
+class ViewOrder:
+    """Endless shuffled passes over the views."""
+
+    def __init__(self, n_views: int, seed: int) -> None:
+        self.n_views = n_views
+        self.rng = np.random.default_rng(seed)
+        self.left: list[int] = []
+
+    def __iter__(self) -> Iterator[int]:
+        while True:
+            if not self.left:
+                self.left = self.rng.permutation(self.n_views).tolist()
+            yield self.left.pop()
+
+
+class Interrupted(Exception):
+    """The user pressed Ctrl-C; the avatar has been saved."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Files of one fit.
+
+    Attributes:
+        folder: ``RUN``.
+        avatar: Where the avatar goes.
+    """
+
+    folder: Path
+    avatar: Path
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.folder / "checkpoint.pt"
+
+    @property
+    def metrics(self) -> Path:
+        return self.folder / "metrics.jsonl"
+
+
+def open_run(out: Path, *, resume: bool) -> Run:
+    """Decide where a fit writes: ``out`` is a folder, or the path of the avatar itself (``out.pt``).
+
+    Raises:
+        DataError: If there is something already, and it is not to be resumed; or nothing to resume.
+    """
+    folder = out.with_suffix("") if out.suffix == ".pt" else out
+    run = Run(folder, out if out.suffix == ".pt" else folder / "avatar.pt")
+    if resume:
+        if not run.checkpoint.is_file():
+            raise DataError(f"{run.checkpoint}: nothing to resume; leave --resume out to start a fit there")
+        return run
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{folder}: is a file; give --out another folder")
+    if folder.is_dir() and any(folder.iterdir()):
+        raise DataError(f"{folder}: is not empty; give --out another folder, or --resume to go on with the fit there")
+    if run.avatar.exists():
+        raise DataError(f"{run.avatar}: exists; give --out another name")
+    return run
+
+
+def fit(
+    subject: Subject,
+    head_model: HeadModel,
+    config: FitConfig,
+    run: Run,
+    *,
+    device: torch.device,
+    seed: int = 0,
+    resume: bool = False,
+) -> Avatar:
+    """Fit an avatar (Section 3): geometry first, then, with the mesh frozen, appearance.
+
+    Writes ``config.toml``, ``metrics.jsonl``, ``checkpoint.pt`` and the avatar into the run's folder. A checkpoint is
+    written every few minutes and when the user interrupts; ``resume`` goes on from it bit for bit.
+
+    Raises:
+        Interrupted: After Ctrl-C; the avatar as far as it came has been saved.
+    """
+    torch.manual_seed(seed)
+    views = Views.of(subject, config.image_scale)
+    background = torch.tensor(subject.background, device=device)
+    checkpoint = _read_checkpoint(run, config) if resume else None
+    run.folder.mkdir(parents=True, exist_ok=True)
+    if checkpoint is None:
+        (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+    capture = CaptureInfo.of(subject)
+    log = MetricsLog(run.metrics)
+
+    body = Body(head_model, subdivisions=config.geometry.subdivisions, device=device)
+    head = PersonalHead(body, subject.params, config.geometry)
+    vertex_gaussians = VertexGaussians(head, config)
+    loop = _Loop(views, background, run, config, log, device, seed)
+    geometry = GeometryStage(vertex_gaussians, config)
+    if checkpoint is not None:
+        geometry.load_state_dict(checkpoint["geometry"])
+    try:
+        avatar = Avatar(vertex_gaussians, None, capture, config)
+        loop.run_stage(geometry, avatar, done=_done(checkpoint, geometry), state=lambda: {"geometry": geometry.state_dict()})
+
+        appearance = build_appearance(head, config, seed=seed)
+        stage = AppearanceStage(appearance, config, seed=seed)
+        if checkpoint is not None and "appearance" in checkpoint:
+            stage.load_state_dict(checkpoint["appearance"])
+        avatar = Avatar(vertex_gaussians, appearance, capture, config)
+        finished = geometry.state_dict()
+        loop.run_stage(
+            stage,
+            avatar,
+            done=_done(checkpoint, stage),
+            state=lambda: {"geometry": finished, "appearance": stage.state_dict()},
+        )
+    finally:
+        log.close()
+    avatar.save(run.avatar)
+    return avatar
+
+
+def _done(checkpoint: dict[str, Any] | None, stage: Stage) -> int:
+    """Iterations of a stage that a checkpoint holds."""
+    if checkpoint is None:
+        return 0
+    if checkpoint["stage"] == stage.name:
+        return int(checkpoint["iteration"])
+    return stage.iterations if stage.name == "geometry" else 0
+
+
+class _StopRequest:
+    """Turns the first Ctrl-C into a request, so that a step is never cut in two; the second one stops at once."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def __enter__(self) -> _StopRequest:
+        self.previous = signal.signal(signal.SIGINT, self._request)
+        return self
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self.previous)
+
+
+class _Loop:
+    """Views in random order through a stage, with progress, log and checkpoints."""
+
+    def __init__(
+        self,
+        views: Views,
+        background: Tensor,
+        run: Run,
+        config: FitConfig,
+        log: MetricsLog,
+        device: torch.device,
+        seed: int,
+    ) -> None:
+        self.views, self.background, self.run, self.config, self.log = views, background, run, config, log
+        self.device = device
+        self.seed = seed
+
+    def run_stage(self, stage: Stage, avatar: Avatar, *, done: int, state: Callable[[], dict[str, Any]]) -> None:
+        order = ViewOrder(len(self.views.images), self.seed)
+        views = iter(order)
+        for _ in range(done):
+            next(views)
+        started = saved = time.monotonic()
+        with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
+            for iteration in range(done + 1, stage.iterations + 1):
+                view = next(views)
+                target = self.views.images[view].to(self.device).float() / 255.0
+                terms = stage.step(self.views.cameras[view], self.views.timesteps[view], target, self.background)
+                if not np.isfinite(terms["loss"]):
+                    raise DataError(
+                        f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "
+                        "lower the learning rates"
+                    )
+                reporter.update(iteration, f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians")
+                now = time.monotonic()
+                if iteration % self.config.log_every == 0 or iteration == stage.iterations:
+                    self.log.write(stage=stage.name, iteration=iteration, seconds=round(now - started, 3), **terms)
+                if now - saved > 60.0 * self.config.checkpoint_minutes or stop.requested:
+                    self._save(stage, iteration, state)
+                    saved = now
+                if stop.requested:
+                    avatar.save(self.run.avatar)
+                    raise Interrupted(f"stopped in {stage.name} at {iteration}/{stage.iterations}")
+        if stage.iterations > done:
+            self._save(stage, stage.iterations, state)
+
+    def _save(self, stage: Stage, iteration: int, state: Callable[[], dict[str, Any]]) -> None:
+        checkpoint = {"stage": stage.name, "iteration": iteration, "config": to_toml(self.config), **state()}
+        with atomic_write(self.run.checkpoint) as file:
+            torch.save(checkpoint, file)
+
+
+def _read_checkpoint(run: Run, config: FitConfig) -> dict[str, Any]:
+    path = existing_file(run.checkpoint)
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+        stored = checkpoint["config"]
+    except Exception as error:
+        raise DataError(f"{path}: not a checkpoint of `mgavatar fit`; remove the folder and start again") from error
+    if stored != to_toml(config):
+        raise DataError(f"{path}: was made with another configuration; give --preset {run.folder / 'config.toml'}")
+    return checkpoint
+
