@@ -15,24 +15,34 @@ TILE_WIDTH = 128
 TILE_HEIGHT = 16
 
 _COMMON = """
-    enum { LANES = 16, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES };
+    enum { LANES = 16, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES, SIZE = TH * STRIDE };
     typedef float vf __attribute__((ext_vector_type(LANES), aligned(4)));
     typedef int vi __attribute__((ext_vector_type(LANES), aligned(4)));
     vf lane;
     for (int i = 0; i < LANES; ++i) lane[i] = (float)i;
-    // exp(-t) for t >= 0: 2^n 2^f with a degree 6 polynomial, relative error below 1e-7.
-    auto exp_neg = [](vf t) -> vf {
-        vf e = __builtin_elementwise_max(t * -1.44269504f, (vf)(-126.0f));
-        vf n = __builtin_elementwise_roundeven(e);
-        vf f = e - n;
+    // Written out, because what the compiler fuses by itself may differ between the two directions.
+    auto fma = [](vf a, vf b, vf c) -> vf {
+#if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
+        return __builtin_elementwise_fma(a, b, c);
+#else
+        return a * b + c;
+#endif
+    };
+    auto least = [](vf a, vf b) -> vf { return __builtin_elementwise_min(a, b); };
+    auto most = [](vf a, vf b) -> vf { return __builtin_elementwise_max(a, b); };
+    // 2^e for e <= 0: 2^n 2^f with a degree 6 polynomial, relative error below 1e-7.
+    auto exp2 = [fma, most](vf e) -> vf {
+        e = most(e, (vf)(-126.0f));
+        const vf n = __builtin_elementwise_roundeven(e);
+        const vf f = e - n;
         vf p = (vf)(1.533757683e-4f);
-        p = p * f + 1.339986036e-3f;
-        p = p * f + 9.618519534e-3f;
-        p = p * f + 5.550328998e-2f;
-        p = p * f + 2.402264661e-1f;
-        p = p * f + 6.931472056e-1f;
-        p = p * f + 1.0f;
-        vi bits = (__builtin_convertvector(n, vi) + 127) << 23;
+        p = fma(p, f, (vf)1.339986036e-3f);
+        p = fma(p, f, (vf)9.618519534e-3f);
+        p = fma(p, f, (vf)5.550328998e-2f);
+        p = fma(p, f, (vf)2.402264661e-1f);
+        p = fma(p, f, (vf)6.931472056e-1f);
+        p = fma(p, f, (vf)1.0f);
+        const vi bits = (__builtin_convertvector(n, vi) + 127) << 23;
         vf scale;
         __builtin_memcpy(&scale, &bits, sizeof(scale));
         return p * scale;
@@ -40,35 +50,39 @@ _COMMON = """
     const int x0 = (tile %% n_columns) * TW, y0 = (tile / n_columns) * TH;
     const int x1 = x0 + TW < width ? x0 + TW : width, y1 = y0 + TH < height ? y0 + TH : height;
     const int begin = tile_begin.data[tile], end = tile_end.data[tile];
+    const float threshold = alpha_threshold;
 """ % {"tile_width": TILE_WIDTH, "tile_height": TILE_HEIGHT}  # noqa: UP031
 
 # The rows of one splat inside the tile, and for each the interval of pixels where alpha can reach the threshold:
-# curvature u^2 + inv_var_y dy^2 <= reach. The slack only admits pixels that the test on alpha then decides.
+# curvature u^2 + inv_var_y dy^2 <= reach, for LANES rows at a time. The slack only admits pixels that the test on alpha
+# then decides, and so does the tail of the last vector: beyond the tile nothing is accepted and nothing is read.
+# All of it is clamped before it becomes an integer.
 _ROWS = """
         const float px = s[0], py = s[1], ox = s[2], oy = s[3], curvature = s[4], shear = s[5], inv_var_y = s[6];
-        const float opacity = s[7];
-        const float reach = alpha_threshold > 0.0f ? 2.0f * __builtin_logf(opacity / alpha_threshold) + 1e-3f : 1e30f;
-        const float half_y = __builtin_sqrtf(reach / inv_var_y);
-        float top = py + oy - half_y - 0.01f, bottom = py + oy + half_y + 0.01f;
-        top = top > (float)y0 ? __builtin_ceilf(top) : (float)y0;
-        bottom = bottom < (float)(y1 - 1) ? __builtin_floorf(bottom) : (float)(y1 - 1);
-        const float inv_curvature = 1.0f / curvature;
-        for (int y = (int)top; y <= (int)bottom; ++y) {
-            const float dy = ((float)y - py) - oy;
-            const float row = inv_var_y * dy * dy;
-            const float room = reach - row;
-            if (!(room >= 0.0f)) continue;
-            const float half_x = __builtin_sqrtf(room * inv_curvature) + 0.01f;
-            const float cx = ox + shear * dy;
-            float left = px + cx - half_x, right = px + cx + half_x;
-            left = left > (float)x0 ? __builtin_ceilf(left) : (float)x0;
-            right = right < (float)(x1 - 1) ? __builtin_floorf(right) : (float)(x1 - 1);
-            const int first = (int)left, stop_x = (int)right + 1;
-            const int base = (y - y0) * STRIDE - x0;
-            for (int x = first; x < stop_x; x += LANES) {
-                const vf u = (lane + ((float)x - px)) - cx;
-                const vf G = exp_neg(0.5f * (curvature * (u * u) + row));
-                const vf alpha = __builtin_elementwise_min(opacity * G, (vf)cap);
+        const float opacity = s[7], reach = s[12], half_y = s[13], radius = s[14];
+        const float steepness = -0.72134752f * curvature;  // exponents are of 2
+        float top = __builtin_ceilf((py + oy) - half_y), bottom = __builtin_floorf((py + oy) + half_y);
+        top = top > (float)y0 ? (top < (float)y1 ? top : (float)y1) : (float)y0;
+        bottom = bottom < (float)(y1 - 1) ? (bottom > (float)(y0 - 1) ? bottom : (float)(y0 - 1)) : (float)(y1 - 1);
+        for (int strip = (int)top; strip <= (int)bottom; strip += LANES) {
+            const int n_rows = (int)bottom - strip + 1 < LANES ? (int)bottom - strip + 1 : LANES;
+            const vf dys = (lane + ((float)strip - py)) - oy;
+            const vf heights = inv_var_y * dys * dys;
+            const vf rooms = reach - heights;
+            const vf half_xs = fma(__builtin_elementwise_sqrt(most(rooms, (vf)0.0f)), (vf)radius, (vf)0.01f);
+            const vf centers = fma((vf)shear, dys, (vf)ox);
+            const vf lefts = least(most(__builtin_elementwise_ceil((px + centers) - half_xs), (vf)(float)x0), (vf)(float)x1);
+            const vf rights = least((px + centers) + half_xs, (vf)(float)(x1 - 1));
+            const vi firsts = __builtin_convertvector(lefts, vi);
+            const vi ends = __builtin_convertvector(__builtin_elementwise_floor(most(rights, lefts - 1.0f)), vi) + 1;
+            for (int j = 0; j < n_rows; ++j) {
+                const float dy = dys[j], center = centers[j], row = -0.72134752f * heights[j];
+                const int base = (strip + j - y0) * STRIDE - x0, stop_x = ends[j];
+                for (int x = firsts[j]; x < stop_x; x += LANES) {
+                    const vf u = (lane + ((float)x - px)) - center;
+                    const vf G = exp2(fma(steepness * u, u, (vf)row));
+                    const vf alpha = least(opacity * G, (vf)cap);
+                    const int i = base + x;
 """
 
 _FORWARD = (
@@ -77,39 +91,36 @@ _FORWARD = (
 """
     + _COMMON
     + """
-    float T[TH * STRIDE], red[TH * STRIDE], green[TH * STRIDE], blue[TH * STRIDE], depth[TH * STRIDE];
-    int accepted[TH * STRIDE];
-    for (int i = 0; i < TH * STRIDE; ++i) {
-        T[i] = 1.0f;
-        red[i] = green[i] = blue[i] = depth[i] = 0.0f;
+    float T[SIZE], red[SIZE], green[SIZE], blue[SIZE], depth[SIZE];
+    int accepted[SIZE];
+    for (int i = 0; i < SIZE; ++i) {
+        T[i] = red[i] = green[i] = blue[i] = depth[i] = 0.0f;
         accepted[i] = -1;
     }
+    for (int y = y0; y < y1; ++y)
+        for (int x = x0; x < x1; ++x) T[(y - y0) * STRIDE + x - x0] = 1.0f;
     for (int k = begin; k < end; ++k) {
         if (((k - begin) & 63) == 63) {
             // Once every pixel of the tile has ended, so has the tile.
-            float most = -1.0f;
-            for (int y = y0; y < y1; ++y)
-                for (int x = x0; x < x1; ++x) {
-                    const float t = T[(y - y0) * STRIDE + x - x0];
-                    most = t > most ? t : most;
-                }
-            if (most < stop) break;
+            vf open = *(const vf*)&T[0];
+            for (int i = LANES; i < SIZE; i += LANES) open = most(open, *(const vf*)&T[i]);
+            if (__builtin_reduce_max(open) < stop) break;
         }
-        const float* s = &splats.data[12 * item_splat.data[items.data[k]]];
+        const float* s = &splats.data[16LL * item_splat.data[items.data[k]]];
 """
     + _ROWS
     + """
-                const int i = base + x;
-                vf t = *(const vf*)&T[i];
-                const vi use = (alpha >= alpha_threshold) & (t >= stop) & (lane < (float)(stop_x - x));
-                const vf a = use ? alpha : (vf)0.0f;
-                const vf w = a * t;
-                *(vf*)&red[i] = *(const vf*)&red[i] + w * s[8];
-                *(vf*)&green[i] = *(const vf*)&green[i] + w * s[9];
-                *(vf*)&blue[i] = *(const vf*)&blue[i] + w * s[10];
-                *(vf*)&depth[i] = *(const vf*)&depth[i] + w * s[11];
-                *(vf*)&T[i] = t * (1.0f - a);
-                *(vi*)&accepted[i] = use ? (vi)k : *(const vi*)&accepted[i];
+                    const vf t = *(const vf*)&T[i];
+                    const vi use = (alpha >= threshold) & (t >= stop);
+                    const vf a = use ? alpha : (vf)0.0f;
+                    const vf w = a * t;
+                    *(vf*)&red[i] = fma(w, (vf)s[8], *(const vf*)&red[i]);
+                    *(vf*)&green[i] = fma(w, (vf)s[9], *(const vf*)&green[i]);
+                    *(vf*)&blue[i] = fma(w, (vf)s[10], *(const vf*)&blue[i]);
+                    *(vf*)&depth[i] = fma(w, (vf)s[11], *(const vf*)&depth[i]);
+                    *(vf*)&T[i] = t * (1.0f - a);
+                    *(vi*)&accepted[i] = use ? (vi)k : *(const vi*)&accepted[i];
+                }
             }
         }
     }
@@ -136,15 +147,13 @@ _BACKWARD = (
 """
     + _COMMON
     + """
-    float T[TH * STRIDE], v_red[TH * STRIDE], v_green[TH * STRIDE], v_blue[TH * STRIDE], v_depth[TH * STRIDE];
-    float behind[TH * STRIDE];
-    int accepted[TH * STRIDE];
+    float T[SIZE], v_red[SIZE], v_green[SIZE], v_blue[SIZE], v_depth[SIZE], behind[SIZE];
+    int accepted[SIZE];
     const float b0 = background.data[0], b1 = background.data[1], b2 = background.data[2];
     const int plane = width * height;
     int furthest = -1;
-    for (int i = 0; i < TH * STRIDE; ++i) {
-        T[i] = 1.0f;
-        v_red[i] = v_green[i] = v_blue[i] = v_depth[i] = behind[i] = 0.0f;
+    for (int i = 0; i < SIZE; ++i) {
+        T[i] = v_red[i] = v_green[i] = v_blue[i] = v_depth[i] = behind[i] = 0.0f;
         accepted[i] = -1;
     }
     for (int y = y0; y < y1; ++y)
@@ -159,48 +168,54 @@ _BACKWARD = (
             accepted[i] = last.data[o];
             furthest = accepted[i] > furthest ? accepted[i] : furthest;
         }
-    for (int k = furthest; k >= begin; --k) {
+    auto sum = [](vf v) -> float {
+        typedef float v8 __attribute__((ext_vector_type(8)));
+        typedef float v4 __attribute__((ext_vector_type(4)));
+        const v8 a = v.lo + v.hi;
+        const v4 b = a.lo + a.hi;
+        return (b[0] + b[2]) + (b[1] + b[3]);
+    };
+    for (int k = end - 1; k >= begin; --k) {
         const int item = items.data[k];
-        const float* s = &splats.data[12 * item_splat.data[item]];
+        float* out = &partials.data[10LL * item];
+        if (k > furthest) {  // hidden in all of the tile
+            for (int c = 0; c < 10; ++c) out[c] = 0.0f;
+            continue;
+        }
+        const float* s = &splats.data[16LL * item_splat.data[item]];
         // Moments of h = G dL/dalpha over the pixels, in u and dy; the parameters' gradients are made of them.
         vf h0 = 0.0f, hu = 0.0f, hy = 0.0f, huu = 0.0f, huy = 0.0f, hyy = 0.0f;
         vf c0 = 0.0f, c1 = 0.0f, c2 = 0.0f, c3 = 0.0f;
 """
     + _ROWS
     + """
-                const int i = base + x;
-                const vi use = (alpha >= alpha_threshold) & (*(const vi*)&accepted[i] >= k) & (lane < (float)(stop_x - x));
-                const vf a = use ? alpha : (vf)0.0f;
-                const vf rest = 1.0f - a;
-                const vf t = __builtin_elementwise_min(*(const vf*)&T[i] / rest, (vf)1.0f);
-                const vf w = a * t;
-                const vf g0 = *(const vf*)&v_red[i], g1 = *(const vf*)&v_green[i];
-                const vf g2 = *(const vf*)&v_blue[i], g3 = *(const vf*)&v_depth[i];
-                const vf seen = g0 * s[8] + g1 * s[9] + g2 * s[10] + g3 * s[11];
-                const vf b = *(const vf*)&behind[i];
-                *(vf*)&T[i] = t;
-                *(vf*)&behind[i] = a * seen + rest * b;
-                c0 += w * g0;
-                c1 += w * g1;
-                c2 += w * g2;
-                c3 += w * g3;
-                const vi free = use & (opacity * G <= cap);
-                const vf h = free ? G * t * (seen - b) : (vf)0.0f;
-                const vf h_u = h * u;
-                h0 += h;
-                hu += h_u;
-                huu += h_u * u;
-                hy += h * dy;
-                huy += h_u * dy;
-                hyy += h * (dy * dy);
+                    const vi use = (alpha >= threshold) & (*(const vi*)&accepted[i] >= k);
+                    const vf a = use ? alpha : (vf)0.0f;
+                    const vf rest = 1.0f - a;
+                    const vf t = least(*(const vf*)&T[i] / rest, (vf)1.0f);
+                    const vf w = a * t;
+                    const vf g0 = *(const vf*)&v_red[i], g1 = *(const vf*)&v_green[i];
+                    const vf g2 = *(const vf*)&v_blue[i], g3 = *(const vf*)&v_depth[i];
+                    const vf seen = fma(g0, (vf)s[8], fma(g1, (vf)s[9], fma(g2, (vf)s[10], g3 * s[11])));
+                    const vf b = *(const vf*)&behind[i];
+                    *(vf*)&T[i] = t;
+                    *(vf*)&behind[i] = fma(a, seen, rest * b);
+                    c0 = fma(w, g0, c0);
+                    c1 = fma(w, g1, c1);
+                    c2 = fma(w, g2, c2);
+                    c3 = fma(w, g3, c3);
+                    const vi free = use & (opacity * G <= cap);
+                    const vf h = free ? G * t * (seen - b) : (vf)0.0f;
+                    const vf h_u = h * u;
+                    h0 += h;
+                    hu += h_u;
+                    huu = fma(h_u, u, huu);
+                    hy = fma(h, (vf)dy, hy);
+                    huy = fma(h_u, (vf)dy, huy);
+                    hyy = fma(h, (vf)(dy * dy), hyy);
+                }
             }
         }
-        auto sum = [](vf v) -> float {
-            float r = 0.0f;
-            for (int j = 0; j < LANES; ++j) r += v[j];
-            return r;
-        };
-        float* out = &partials.data[10 * item];
         const float mu = sum(hu), my = sum(hy);
         out[0] = opacity * curvature * mu;
         out[1] = opacity * (inv_var_y * my - curvature * shear * mu);
@@ -240,7 +255,7 @@ def _composite_tile_bwd(
 def composite_rows_kernel(
     # In:
     first: int,
-    splats: wp.array2d[wp.float32],  # [N, 12] projection.SPLAT
+    splats: wp.array2d[wp.float32],  # [N, 16] projection.SPLAT
     tile_begin: wp.array[wp.int32],  # [T]
     tile_end: wp.array[wp.int32],  # [T]
     items: wp.array[wp.int32],  # [M]
@@ -265,7 +280,7 @@ def composite_rows_kernel(
 def composite_rows_bwd_kernel(
     # In:
     first: int,
-    splats: wp.array2d[wp.float32],  # [N, 12]
+    splats: wp.array2d[wp.float32],  # [N, 16]
     tile_begin: wp.array[wp.int32],  # [T]
     tile_end: wp.array[wp.int32],  # [T]
     items: wp.array[wp.int32],  # [M]

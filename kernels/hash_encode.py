@@ -128,22 +128,26 @@ _POINTS_BWD = """
     for (int from = begin; from < end; from += TILE) {
         const int many = end - from < TILE ? end - from : TILE;
         locate(from, many);
-        for (int i = 0; i < many; ++i) {
-            const REAL* g = grad.data + (long long)(from + i) * stride + level * FEATURES;
-            REAL slope[3] = {0, 0, 0};
-            for (int corner = 0; corner < 8; ++corner) {
-                const int bx = corner & 1, by = corner >> 1 & 1, bz = corner >> 2;
+        REAL slope[3][TILE];
+        for (int axis = 0; axis < 3; ++axis)
+            for (int i = 0; i < TILE; ++i)
+                slope[axis][i] = 0;
+        for (int corner = 0; corner < 8; ++corner) {
+            const int bx = corner & 1, by = corner >> 1 & 1, bz = corner >> 2;
+            for (int i = 0; i < TILE; ++i) {
+                const REAL* g = grad.data + (long long)(from + (i < many ? i : 0)) * stride + level * FEATURES;
                 REAL along = 0;
                 for (int f = 0; f < FEATURES; ++f)
                     along += g[f] * values[(long long)entry[corner][i] * FEATURES + f];
-                slope[0] += (bx ? along : -along) * part[1][by][i] * part[2][bz][i];
-                slope[1] += (by ? along : -along) * part[0][bx][i] * part[2][bz][i];
-                slope[2] += (bz ? along : -along) * part[0][bx][i] * part[1][by][i];
+                slope[0][i] += (bx ? along : -along) * part[1][by][i] * part[2][bz][i];
+                slope[1][i] += (by ? along : -along) * part[0][bx][i] * part[2][bz][i];
+                slope[2][i] += (bz ? along : -along) * part[0][bx][i] * part[1][by][i];
             }
-            for (int axis = 0; axis < 3; ++axis)
-                if (inside[axis][i])
-                    grad_points.data[(long long)(from + i) * 3 + axis] += slope[axis] * REAL(resolution);
         }
+        for (int axis = 0; axis < 3; ++axis)
+            for (int i = 0; i < many; ++i)
+                if (inside[axis][i])
+                    grad_points.data[(long long)(from + i) * 3 + axis] += slope[axis][i] * REAL(resolution);
     }
 """
 

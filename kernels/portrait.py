@@ -266,9 +266,9 @@ def mix3(values: wp.array[wp.vec3], corners: wp.vec3i, weights: wp.vec3) -> wp.v
 @wp.func
 def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3) -> float:
     """1 where nothing stands between the point and the key light; a hard shadow, softened by the pixel's samples."""
-    if wp.dot(normal, light) <= 0.0 or wp.mesh_query_ray_anyhit(
-        mesh, point + 0.002 * normal + 0.001 * light, light, 0.5
-    ):
+    if wp.dot(normal, light) <= 0.0:
+        return 0.25
+    if wp.mesh_query_ray_anyhit(mesh, point + 0.002 * normal + 0.001 * light, light, 0.5):
         return 0.25
     return 1.0
 

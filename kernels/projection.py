@@ -19,9 +19,20 @@ import warp as wp
 
 SPLAT = (
     "pixel_x", "pixel_y", "offset_x", "offset_y", "curvature", "shear", "inv_var_y", "opacity",
-    "red", "green", "blue", "depth",
+    "red", "green", "blue", "depth", "reach", "half_y", "radius", "unused",
 )  # fmt: skip
-"""Columns of a splat; its mean is the centre of (pixel_x, pixel_y), which are whole numbers, plus the offset [px]."""
+"""Columns of a splat, one cache line in single precision.
+
+The mean is the centre of (pixel_x, pixel_y), which are whole numbers, plus the offset [px]. The ellipse where alpha is at
+the threshold is ``curvature u^2 + inv_var_y (y - my)^2 = reach``; ``half_y`` is its half height, ``radius`` is
+``1 / sqrt(curvature)``. Reach and half height are a little larger, so that rounding never cuts a pixel off.
+"""
+
+NO_EXTENT = 1.0e30
+"""Reach without a threshold: a Gaussian touches every pixel."""
+
+LARGEST = 1.0e18
+"""Depths and colours beyond this are not drawn: their squares would not fit into single precision."""
 
 GRADIENT = ("mean_x", "mean_y", "curvature", "shear", "inv_var_y", "opacity", "red", "green", "blue", "depth")
 """Columns of a splat's gradient."""

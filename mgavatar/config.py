@@ -30,8 +30,9 @@ class GeometryConfig:
     """Geometry stage (Section 3.1): vertex-bound Gaussians move the mesh."""
 
     iterations: int = 100_000
-    subdivisions: int = 1
-    """Midpoint subdivisions of the head model; the paper goes from 5K to 20K vertices with one."""
+    subdivisions: int | Literal["auto"] = "auto"
+    """Midpoint subdivisions of the head model; the paper goes from 5K to 20K vertices with one, and ``auto`` takes one
+    unless the head has that many already."""
     lr_refine: float = 1e-3
     """RefineNet: triplane, Phi_id and Phi_pose."""
     lr_shape: float = 1e-2
@@ -248,7 +249,7 @@ def check(config: FitConfig) -> None:
     bounds = (
         ("image-scale", config.image_scale, 0.01, 1.0),
         ("geometry.iterations", g.iterations, 1, 10_000_000),
-        ("geometry.subdivisions", g.subdivisions, 0, 3),
+        ("geometry.subdivisions", 0 if g.subdivisions == "auto" else g.subdivisions, 0, 3),
         ("geometry.triplane-resolution", g.triplane_resolution, 2, 1024),
         ("geometry.hidden", g.hidden, 1, 4096),
         ("geometry.final-lr", g.final_lr, 1e-6, 1.0),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from PIL import Image
 
 from mgavatar.capture.synthetic import make_synthetic_capture
@@ -18,6 +19,8 @@ from mgavatar.capture.synthetic_person import Person, Pose, make_person, subdivi
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
 from mgavatar.head.procedural import build_head
+from mgavatar.kernels.portrait import View, portrait
+from mgavatar.kernels.ray_cast import RayMesh
 
 SIZE = (48, 40)
 KEYS = {"shape", "expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation"}
@@ -271,6 +274,31 @@ def test_unnamed_directions_are_chosen_by_the_region_that_they_move(head: HeadMo
     motion = np.linalg.norm(head.shapedirs[:, :, head.n_shape + chosen[0]], axis=1)
     height = float(np.average(head.v_template[:, 1] - eyes[1], weights=motion**2))
     assert -0.09 < height < -0.03  # the mouth
+
+
+def a_wall(x: float) -> tuple[RayMesh, tuple[torch.Tensor, ...]]:
+    """A wall of cloth 1 m ahead of the origin that ends at ``x`` [m], and its surface."""
+    verts = torch.tensor([[-9.0, -9, -1], [x, -9, -1], [x, 9, -1], [-9, 9, -1]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]], dtype=torch.int32)
+    up = torch.tensor([[0.0, 0, 1]]).expand(4, 3).contiguous()
+    return RayMesh(verts, faces), (faces, torch.full((2,), 4, dtype=torch.int32), verts, torch.ones(4, 4), up, up)
+
+
+def test_cover_is_the_share_of_a_pixel(person: Person) -> None:
+    """A wall that ends at 2.5 of 5 pixels covers two of them, half of the third and none of the others."""
+    view = View()
+    view.to_world = wp.mat33(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
+    view.focal, view.center, view.columns = wp.vec2(10.0, 10.0), wp.vec2(2.5, 0.5), 5
+    look = make_look(person, np.random.default_rng(0))
+    mesh, surface = a_wall(0.0)
+    samples = torch.tensor([[(i % 4 + 0.5) / 4, (i // 4 + 0.5) / 4] for i in range(16)])
+    pixels = portrait(mesh, view, look, samples=samples, n_pixels=5, surface=surface)
+    assert pixels[:, 3].tolist() == [1.0, 1.0, 0.5, 0.0, 0.0]
+    assert not pixels[3:].any()
+    assert (pixels[:2, :3] > 0.05).all()
+    assert (pixels[:, :3] <= pixels[:, 3:]).all()
+    with pytest.raises(ValueError, match="parts of lengths"):
+        portrait(mesh, view, look, samples=samples, n_pixels=5, surface=(*surface[:5], surface[5][:3]))
 
 
 def test_subdivision_keeps_the_surface() -> None:

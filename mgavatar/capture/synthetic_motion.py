@@ -12,7 +12,7 @@ _ACTIONS = {
     "brows": ("browinnerup", "browouterup", "browraise", "browup", "browsup"),
     "blink": ("blink", "eyeclose", "lidclose"),
     "round": ("pucker", "funnel"),
-    "stretch": ("stretch", "frown"),
+    "stretch": ("stretch",),
     "squint": ("squint", "cheekraise"),
 }
 """What an action is called in the names of expression directions, without case and punctuation."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -15,6 +16,10 @@ from mgavatar.head.subdivide import subdivide
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
+
+
+FINE_ENOUGH = 12_000
+"""Vertices; the paper's mesh has 20K."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +77,12 @@ class Body:
         fine: The same after subdivision, without its directions.
     """
 
-    def __init__(self, model: HeadModel, *, subdivisions: int, device: torch.device | str = "cpu") -> None:
+    def __init__(
+        self, model: HeadModel, *, subdivisions: int | Literal["auto"], device: torch.device | str = "cpu"
+    ) -> None:
+        """Subdivide so many times; ``auto`` is once, unless the model is about as fine as the paper's mesh already."""
+        if subdivisions == "auto":
+            subdivisions = 1 if len(model.v_template) < FINE_ENOUGH else 0
         self.model = model
         self.subdivisions = subdivisions
         self.device = torch.device(device)

@@ -1,8 +1,9 @@
 """A head model in FLAME's schema that the program builds itself: no licensed data, the same arrays every time.
 
-The pieces, in the order in which they are made: the form of the head (``procedural_surface``), its mesh and texture
-atlas (``procedural_mesh``, with ``procedural_ear`` and ``procedural_parts``), joints and skinning
-(``procedural_rig``), identity and expression directions (``procedural_identity``, ``procedural_expression``).
+The pieces, in the order in which they are made: the form of the head (``procedural_surface``), its triangulation
+(``procedural_sheet``), mesh and texture atlas (``procedural_mesh``, with ``procedural_ear`` and ``procedural_parts``),
+joints and skinning (``procedural_rig``), identity and expression directions (``procedural_identity``,
+``procedural_expression``).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mgavatar.head.procedural_rig import (
 def build_head() -> HeadModel:
     """Build the procedural head: about 5,000 vertices, 300 identity and 100 expression directions.
 
-    The result is kept in memory and shared: do not change its arrays (they are read-only).
+    The result is kept in memory and shared: do not change its arrays.
 
     Returns:
         The model in FLAME's frame, ``expr_basis`` ``"procedural"``.
@@ -49,14 +50,11 @@ def build_head() -> HeadModel:
         "vt": mesh.vt.astype(np.float32),
         "ft": mesh.ft.astype(np.int32),
     }
-    masks = regions(mesh)
-    for array in (*arrays.values(), *masks.values()):
-        array.flags.writeable = False
     return HeadModel(
         **arrays,
         n_shape=shape.shape[-1],
         n_expr=expr.shape[-1],
-        masks=masks,
+        masks=regions(mesh),
         expr_basis="procedural",
         expr_names=names,
         name="procedural head",

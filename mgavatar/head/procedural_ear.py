@@ -24,9 +24,9 @@ RINGS = np.array(
         (1.00, 0.91, 1.00, -0.8),  # rim
         (0.95, 0.86, 1.00, 1.2),
         (0.84, 0.78, 1.00, -0.3),
-        (0.74, 0.69, 1.00, -2.2),  # groove inside the rim
-        (0.61, 0.60, 1.00, 0.6),  # antihelix
-        (0.45, 0.48, 0.80, -1.5),
+        (0.75, 0.69, 1.00, -3.0),  # groove inside the rim
+        (0.60, 0.59, 1.00, 1.4),  # antihelix
+        (0.46, 0.48, 0.75, -1.5),
         (0.30, 0.34, 0.30, -2.0),  # wall of the concha
     ]
 )
@@ -38,8 +38,8 @@ def _ring(skin: Callable[[Array], Array], centre: Array, row: Array, t: Array) -
     behind = smoothstep(-0.75, 0.25, c)
     size = row[1] + (row[0] - row[1]) * behind
     back, up = size * HALF_WIDTH * c * (1.0 + 0.09 * s), size * HALF_HEIGHT * s
-    back = back + LEAN * up - 0.0020 * (1.0 - size)
-    up = up - 0.0050 * np.maximum(0.8 - size, 0.0)
+    back = back + LEAN * up - 0.0042 * (1.0 - size)
+    up = up - 0.0075 * np.maximum(0.8 - size, 0.0)
     foot = skin(centre + np.stack([back, up], axis=1))
     plate = 0.60 * np.maximum(back + 0.011 - LEAN * up, 0.0)
     lobe = 1.0 - 0.75 * smoothstep(0.45, 0.95, -s)
@@ -64,7 +64,7 @@ def ear_rings(
         Points on the sheet, where the rings are nested ellipses; points in space [m].
     """
     centre = np.array([EAR_ANGLE * around, float(q_of_level(EAR_LEVEL))])
-    # On the sheet p grows to the back of the left half: counter-clockwise from outside is up, then forwards.
+    # Seen from outside, the left half's p grows to the right and q upwards: this ring is counter-clockwise.
     t = np.linspace(0.0, 2.0 * np.pi, n, endpoint=False)
     back, up = HALF_WIDTH * np.cos(t) * (1.0 + 0.09 * np.sin(t)), HALF_HEIGHT * np.sin(t)
     ellipse = RINGS[0, 0] * np.stack([back + LEAN * up, up], axis=1)

@@ -50,6 +50,7 @@ def jaw_share(mesh: HeadMesh) -> Array:
     x, y, z = np.abs(mesh.rest[:, 0]), mesh.rest[:, 1], mesh.rest[:, 2]
     verts = mesh.verts
     below = (mesh.part == "skin") & (y < form.MOUTH_Y - 0.002) & (y > -0.088) & (z > 0.012) & (x < 0.022)
+    below |= (mesh.part == "skin") & (y < -0.064) & (z > -0.004) & (mesh.level < 12.3)  # the body of the jaw
     socket = mesh.part == "socket"
     below |= socket & (verts[:, 1] < form.MOUTH_Y - 0.0055) & (verts[:, 2] > 0.010)
     above = (mesh.part == "skin") & (
@@ -171,12 +172,13 @@ def regions(mesh: HeadMesh) -> dict[str, Array]:
     front = (z > -0.018 + 0.10 * np.clip(-0.05 - y, 0.0, 0.02)) & (y < 0.082) & (mesh.level < 12.6)
     lips = np.zeros(len(verts), bool)
     lips[np.concatenate([both_sides(mesh, f"lip_{k}") for k in range(len(RED_RINGS))])] = True
-    shoulders = skin & (mesh.level > 15.6)
+    face, shoulders = skin & front & ~ears, skin & (mesh.level > 15.6)
+    scalp = skin & ~front & ~ears & (y - 0.25 * (z + 0.05) > -0.01) & (mesh.level < 8.5)
     eye = part == "eye"
     masks = {
-        "face": skin & front & ~ears,
-        "scalp": skin & ~front & ~ears & (y - 0.25 * (z + 0.05) > -0.01) & (mesh.level < 8.5),
-        "neck": skin & (mesh.level >= 12.9) & (mesh.level <= 15.6),
+        "face": face,
+        "scalp": scalp,
+        "neck": skin & ~(face | scalp | ears | shoulders),
         "boundary": boundary,
         "eyeballs": eye,
         "left_eyeball": eye & left,

@@ -1,0 +1,103 @@
+"""Predictors that know nothing of heads: what a score must beat before it means anything."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mgavatar.avatar import Avatar
+from mgavatar.capture.images import read_images
+from mgavatar.capture.subject import Frame, Subject
+from mgavatar.head.body import pose_of
+
+BEST_PSNR = 100.0
+"""What equal images score [dB]: JSON has no infinity."""
+
+_POINTS = 500
+
+
+def psnr(image: Tensor, target: Tensor) -> float:
+    """Peak signal-to-noise ratio of images in 0..1 [dB], at most 100."""
+    error = float((image - target).square().mean())
+    return min(BEST_PSNR, -10.0 * math.log10(max(error, 1e-30)))
+
+
+class TrivialPredictors:
+    """White, the mean training image, and the nearest training image, each scored as an avatar is.
+
+    The nearest image is that of the same camera in the pose whose head lies nearest: the mean distance between
+    vertices, so that angles, expressions and translations weigh what they move. A camera that training lacks is
+    replaced by the nearest one.
+    """
+
+    def __init__(self, avatar: Avatar, subject: Subject) -> None:
+        """Prepare for a capture; ``avatar`` lends its head to compare poses with."""
+        self._train = subject.frames["train"]
+        self._camera_positions = {frame.camera_id: frame.camera.position for frame in self._train}
+        self._points = _head_points(avatar, subject)
+        self._read = lru_cache(maxsize=16)(_read_float)
+        self._mean = lru_cache(maxsize=4)(self._mean_image)
+
+    def scores(self, frame: Frame, target: Tensor) -> dict[str, float | None]:
+        """PSNR of each predictor for one image [dB]; None where there is nothing to predict with."""
+        mean = self._mean(target.shape[2], target.shape[1])
+        nearest = self.nearest_frame(frame)
+        return {
+            "white": psnr(torch.ones_like(target), target),
+            "mean_image": None if mean is None else psnr(mean, target),
+            "nearest_frame": None if nearest is None else psnr(self._read(nearest), target),
+        }
+
+    def nearest_frame(self, frame: Frame) -> Frame | None:
+        """The training frame that looks most like ``frame`` by camera and pose, or None for a training frame."""
+        if frame in self._train:
+            return None
+        size = (frame.camera.width, frame.camera.height)
+        same_size = [other for other in self._train if (other.camera.width, other.camera.height) == size]
+        if not same_size:
+            return None
+        camera_id = self._nearest_camera(frame, {other.camera_id for other in same_size})
+        candidates = [other for other in same_size if other.camera_id == camera_id]
+        distances = [self._pose_distance(frame.timestep, other.timestep) for other in candidates]
+        return candidates[int(np.argmin(distances))]
+
+    def _nearest_camera(self, frame: Frame, camera_ids: set[int]) -> int:
+        if frame.camera_id in camera_ids:
+            return frame.camera_id
+        position = frame.camera.position
+        return min(sorted(camera_ids), key=lambda index: float(np.linalg.norm(self._camera_positions[index] - position)))
+
+    def _pose_distance(self, a: int, b: int) -> float:
+        return float((self._points[a] - self._points[b]).norm(dim=1).mean())
+
+    def _mean_image(self, width: int, height: int) -> Tensor | None:
+        """Mean of the training images of this size, [3, H, W], or None if there is none."""
+        frames = [frame for frame in self._train if (frame.camera.width, frame.camera.height) == (width, height)]
+        if not frames:
+            return None
+        total = torch.zeros(3, height, width, dtype=torch.int64)
+        for frame in frames:
+            total += read_images([frame])[0]
+        return (total.double() / (255.0 * len(frames))).float()
+
+
+def _read_float(frame: Frame) -> Tensor:
+    return read_images([frame], threads=1)[0].float() / 255.0
+
+
+@torch.no_grad()
+def _head_points(avatar: Avatar, subject: Subject) -> Tensor:
+    """Some vertices of the head in every tracked pose [m], shape [T, P, 3], on the CPU."""
+    body = avatar.head.body
+    canonical = avatar.head.canonical()
+    joints = body.joints(canonical)
+    step = max(1, body.n_verts // _POINTS)
+    points = []
+    for timestep in range(len(subject.params)):
+        pose = pose_of(subject.params, timestep, body.model.n_expr).to(avatar.device)
+        points.append(body.posed(canonical, pose, joints=joints)[::step].cpu())
+    return torch.stack(points)
