@@ -35,13 +35,13 @@ _BLOCK_SUM = """
     if (lane < 10) {
         REAL v = (REAL)0;
         for (int w = 0; w < BLOCK / 32; ++w) v += sums[w][lane];
-        partials.data[row * 10 + lane] = v;
+        partials.data[row * 10LL + lane] = v;
     }
     __syncthreads();
 #else
     // On a CPU the block's threads run one after the other: each adds its share.
     if (active)
-        for (int c = 0; c < 10; ++c) partials.data[row * 10 + c] += values[c];
+        for (int c = 0; c < 10; ++c) partials.data[row * 10LL + c] += values[c];
 #endif
 """
 
@@ -69,7 +69,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.kernel(module=module, enable_backward=False)
     def composite_kernel(
         # In:
-        splats: wp.array2d[real],  # [N, 12] projection.SPLAT
+        splats: wp.array2d[real],  # [N, 16] projection.SPLAT
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
         items: wp.array[wp.int32],  # [M]
@@ -117,7 +117,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.kernel(module=module, enable_backward=False)
     def composite_bwd_kernel(
         # In:
-        splats: wp.array2d[real],  # [N, 12]
+        splats: wp.array2d[real],  # [N, 16]
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
         items: wp.array[wp.int32],  # [M]

@@ -122,17 +122,18 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         low_pass: wp.float64,
         alpha_threshold: wp.float64,
         # Out:
-        splats: wp.array2d[real],  # [N, 12]
+        splats: wp.array2d[real],  # [N, 16]
         tiles: wp.array2d[wp.int32],  # [N, 4] first and last + 1 tile column, then row; all zero where culled
         keys: wp.array[wp.float32],  # [N] depth, or 0 where culled
     ):
         n = first + wp.tid()
         for c in range(4):
             tiles[n, c] = 0
-        for c in range(12):
+        for c in range(16):
             splats[n, c] = real(0.0)
         keys[n] = wp.float32(0.0)
         zero, one, half = wp.float64(0.0), wp.float64(1.0), wp.float64(0.5)
+        largest, tiny = wp.float64(LARGEST), wp.float64(1.0e-30)
         view = rotation_part(viewmats[0])
         p = view * wide3(means[n]) + translation_part(viewmats[0])
         q = wide4(quats[n])
@@ -140,9 +141,11 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         opacity = wp.float64(opacities[n])
         color_sq = wp.length_sq(wide3(colors[n]))
         # Written so that a NaN anywhere fails them.
-        if not (p[2] > near) or not (norm > wp.float64(1.0e-12)) or not (norm < wp.float64(1.0e12)):
+        if not (p[2] > near) or not (p[2] < largest) or not (color_sq < largest * largest):
             return
-        if not (opacity >= alpha_threshold) or not (opacity < wp.float64(1.0e30)) or not (color_sq < wp.float64(1.0e60)):
+        if not (norm > wp.float64(1.0e-12)) or not (norm < wp.float64(1.0e12)):
+            return
+        if not (opacity >= alpha_threshold) or not (opacity < largest):
             return
         g = view * (_rotation_of(q / norm) * wp.diag(wide3(scales[n])))
         focal_x, focal_y = wp.float64(Ks[0][0, 0]), wp.float64(Ks[0][1, 1])
@@ -159,19 +162,20 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         mx = focal_x * p[0] / p[2] + center_x
         my = focal_y * p[1] / p[2] + center_y
         # Outside these the footprint does not fit into single precision.
-        if not (det > wp.float64(1.0e-30)) or not (var_x < wp.float64(1.0e30)) or not (var_y < wp.float64(1.0e30)):
+        if not (det > tiny) or not (var_x < one / tiny) or not (var_y < one / tiny):
             return
-        half_x, half_y = wp.float64(1.0e12), wp.float64(1.0e12)  # without a threshold a Gaussian touches every pixel
+        if not (var_y > tiny) or not (det > tiny * var_y) or not (wp.abs(mx) < one / tiny) or not (wp.abs(my) < one / tiny):
+            return
+        reach = wp.float64(NO_EXTENT)
         if alpha_threshold > zero:
-            reach = wp.float64(2.0) * wp.log(opacity / alpha_threshold)
-            half_x = wp.sqrt(reach * var_x)
-            half_y = wp.sqrt(reach * var_y)
-        # Pixel i is touched if its centre i + 0.5 is within the half extent; the slack is for rounding in the blending.
-        slack = wp.float64(0.51)
-        x0 = wp.clamp(wp.floor(mx - half_x - slack + half), zero, wp.float64(width))
-        x1 = wp.clamp(wp.ceil(mx + half_x + slack - half), zero, wp.float64(width))
-        y0 = wp.clamp(wp.floor(my - half_y - slack + half), zero, wp.float64(height))
-        y1 = wp.clamp(wp.ceil(my + half_y + slack - half), zero, wp.float64(height))
+            reach = wp.float64(2.0) * wp.log(opacity / alpha_threshold) + wp.float64(1.0e-3)
+        half_x = wp.sqrt(reach * var_x) + wp.float64(0.01)
+        half_y = wp.sqrt(reach * var_y) + wp.float64(0.01)
+        # Pixel i is touched if its centre i + 0.5 is within the half extent.
+        x0 = wp.clamp(wp.ceil(mx - half_x - half), zero, wp.float64(width))
+        x1 = wp.clamp(wp.floor(mx + half_x + half), zero, wp.float64(width))
+        y0 = wp.clamp(wp.ceil(my - half_y - half), zero, wp.float64(height))
+        y1 = wp.clamp(wp.floor(my + half_y + half), zero, wp.float64(height))
         if not (x1 > x0) or not (y1 > y0):
             return
         tiles[n, 0] = int(x0) // tile_width
@@ -191,6 +195,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         splats[n, 9] = colors[n][1]
         splats[n, 10] = colors[n][2]
         splats[n, 11] = real(p[2])
+        splats[n, 12] = real(reach)
+        splats[n, 13] = real(half_y)
+        splats[n, 14] = real(wp.sqrt(det / var_y))
 
     @wp.kernel(module=module, enable_backward=False)
     def project_bwd_kernel(

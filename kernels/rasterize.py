@@ -14,6 +14,12 @@ from mgavatar.kernels.tiling import WorkLists, build_work_lists
 
 Form = Literal["auto", "plain", "rows"]
 
+LEAST_STOP = 1e-30
+"""Where ``stop = 0`` ends a pixel: past it the transmittance would underflow and the adjoint could not walk back."""
+
+LARGEST_CAP = 1.0 - 1e-6
+"""In single precision ``1 - alpha`` needs some bits left."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class RasterSettings:
@@ -66,8 +72,8 @@ def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, setting
         raise ValueError(f"means is {tensors[0].dtype}, needs float32 or float64")
     if width < 1 or height < 1:
         raise ValueError(f"image size must be positive, got {width} x {height}")
-    if not 0.0 < settings.alpha_cap < 1.0:
-        raise ValueError(f"alpha_cap must lie between 0 and 1, got {settings.alpha_cap}")
+    if not 0.0 < settings.alpha_cap <= LARGEST_CAP:
+        raise ValueError(f"alpha_cap must lie between 0 and {LARGEST_CAP}, got {settings.alpha_cap}")
     if settings.near <= 0.0:
         raise ValueError(f"near must be positive, got {settings.near}")
 
@@ -93,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
         form = _form(settings, means)
         tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
         n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
-        splats = means.new_empty(n, 12)
+        splats = means.new_empty(n, 16)
         tiles = torch.empty(n, 4, dtype=torch.int32, device=means.device)
         keys = torch.empty(n, dtype=torch.float32, device=means.device)
         camera = (viewmat[None], K[None], width, height)
@@ -108,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
         final_T = means.new_empty(height, width)
         last = torch.empty(height, width, dtype=torch.int32, device=means.device)
         inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
-        knobs = [settings.alpha_threshold, settings.stop, settings.alpha_cap]
+        knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
         n_tiles = n_columns * n_rows
         if form == "rows":
             bridge.launch_ranges(
@@ -132,9 +138,10 @@ class _Rasterize(torch.autograd.Function):
         lists: WorkLists = ctx.lists
         settings: RasterSettings = ctx.settings
         v_image = v_image.contiguous()
-        partials = means.new_zeros(len(lists.items), 10)
         n_tiles = len(lists.tile_begin)
         rows = ctx.form == "rows"
+        # The rows write every partial; the plain form adds up threads that run one after the other.
+        partials = (means.new_empty if rows else means.new_zeros)(len(lists.items), 10)
         n_columns = -(-width // (compositing_rows.TILE_WIDTH if rows else compositing.TILE))
         inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
         inputs += [settings.alpha_threshold, settings.alpha_cap, final_T, last, v_image]

@@ -23,13 +23,22 @@ _WIDTH, _HEIGHT = 128, 16
 _COMMON = """
     enum { LANES = 16, R = 5, TW = %d, TH = %d, STRIDE = TW + 2 * LANES };
     typedef float vf __attribute__((ext_vector_type(LANES), aligned(4)));
+    typedef int vi __attribute__((ext_vector_type(LANES), aligned(4)));
     const float window[11] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
                               0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
     const int columns = (width + TW - 1) / TW, rows = (height + TH - 1) / TH;
     const int channel = item / (columns * rows), tile = item %% (columns * rows);
     const int x0 = (tile %% columns) * TW, y0 = (tile / columns) * TH;
     const int nx = width - x0 < TW ? width - x0 : TW, ny = height - y0 < TH ? height - y0 : TH;
-    const int plane = channel * width * height;
+    const int plane = channel * width * height, all = 3 * width * height;
+    vf lane;
+    for (int i = 0; i < LANES; ++i) lane[i] = (float)i;
+    auto along = [&](const float* p) -> vf {
+        vf s = 0.0f;
+        #pragma clang loop unroll(full)
+        for (int k = 0; k < 11; ++k) s += window[k] * *(const vf*)(p + k);
+        return s;
+    };
     // Column i of a local buffer is pixel x0 + i - R; outside the image it is zero.
     auto load = [&](const float* source, float* to) {
         for (int j = 0; j < ny + 2 * R; ++j) {
@@ -48,16 +57,16 @@ _FORWARD = (
     + _COMMON
     + """
     float a[(TH + 2 * R) * STRIDE], b[(TH + 2 * R) * STRIDE];
-    float down[5][STRIDE + LANES];
+    float down[5][STRIDE + LANES], row[3][TW];
     load(image.data, a);
     load(target.data, b);
     for (int m = 0; m < 5; ++m)
         for (int i = STRIDE; i < STRIDE + LANES; ++i) down[m][i] = 0.0f;
-    vf total = 0.0f;
-    float absolute = 0.0f;
+    vf total = 0.0f, absolute = 0.0f;
     for (int j = 0; j < ny; ++j) {
         for (int i = 0; i < nx + 2 * R; i += LANES) {
             vf s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f, s4 = 0.0f;
+            #pragma clang loop unroll(full)
             for (int k = 0; k < 11; ++k) {
                 const vf x = *(const vf*)&a[(j + k) * STRIDE + i], y = *(const vf*)&b[(j + k) * STRIDE + i];
                 const vf wx = window[k] * x, wy = window[k] * y;
@@ -74,34 +83,30 @@ _FORWARD = (
             *(vf*)&down[4][i] = s4;
         }
         for (int i = 0; i < nx; i += LANES) {
-            vf f[5];
-            for (int m = 0; m < 5; ++m) {
-                f[m] = 0.0f;
-                for (int k = 0; k < 11; ++k) f[m] += window[k] * *(const vf*)&down[m][i + k];
-            }
-            const vf mx = f[0], my = f[1];
-            const vf p = 2.0f * mx * my + 1e-4f, q = 2.0f * (f[4] - mx * my) + 9e-4f;
-            const vf r = mx * mx + my * my + 1e-4f, s = (f[2] - mx * mx) + (f[3] - my * my) + 9e-4f;
+            const vf mx = along(down[0] + i), my = along(down[1] + i);
+            const vf xx = along(down[2] + i), yy = along(down[3] + i), xy = along(down[4] + i);
+            const vf p = 2.0f * mx * my + 1e-4f, q = 2.0f * (xy - mx * my) + 9e-4f;
+            const vf r = mx * mx + my * my + 1e-4f, s = (xx - mx * mx) + (yy - my * my) + 9e-4f;
             const vf rs = 1.0f / (r * s), value = p * q * rs;
             const vf by_xx = -value / s, by_xy = 2.0f * p * rs;
             const vf by_mu = 2.0f * (my * q * rs - value * mx / r) - by_xy * my - 2.0f * by_xx * mx;
-            const int o = plane + (y0 + j) * width + x0 + i, n = nx - i < LANES ? nx - i : LANES;
-            const int all = 3 * width * height;
-            for (int l = 0; l < n; ++l) {
-                total[l] += value[l];
-                maps.data[o + l] = by_mu[l];
-                maps.data[all + o + l] = by_xx[l];
-                maps.data[2 * all + o + l] = by_xy[l];
-            }
+            const vf d = *(const vf*)&a[(j + R) * STRIDE + i + R] - *(const vf*)&b[(j + R) * STRIDE + i + R];
+            const vi inside = lane < (float)(nx - i);
+            total += inside ? value : (vf)0.0f;
+            absolute += inside ? __builtin_elementwise_abs(d) : (vf)0.0f;
+            *(vf*)&row[0][i] = by_mu;
+            *(vf*)&row[1][i] = by_xx;
+            *(vf*)&row[2][i] = by_xy;
         }
-        for (int i = 0; i < nx; ++i) {
-            const float d = a[(j + R) * STRIDE + i + R] - b[(j + R) * STRIDE + i + R];
-            absolute += d < 0.0f ? -d : d;
-        }
+        for (int m = 0; m < 3; ++m)
+            __builtin_memcpy(&maps.data[m * all + plane + (y0 + j) * width + x0], row[m], nx * sizeof(float));
     }
-    float sum = 0.0f;
-    for (int l = 0; l < LANES; ++l) sum += total[l];
-    sums.data[2 * item] = absolute;
+    float sum = 0.0f, sum_absolute = 0.0f;
+    for (int l = 0; l < LANES; ++l) {
+        sum += total[l];
+        sum_absolute += absolute[l];
+    }
+    sums.data[2 * item] = sum_absolute;
     sums.data[2 * item + 1] = sum;
 #endif
 """
@@ -112,8 +117,7 @@ _BACKWARD = (
     + _COMMON
     + """
     float a[3][(TH + 2 * R) * STRIDE];
-    float down[3][STRIDE + LANES];
-    const int all = 3 * width * height;
+    float down[3][STRIDE + LANES], row[3][TW];
     for (int m = 0; m < 3; ++m) {
         load(maps.data + m * all, a[m]);
         for (int i = STRIDE; i < STRIDE + LANES; ++i) down[m][i] = 0.0f;
@@ -123,22 +127,20 @@ _BACKWARD = (
         for (int i = 0; i < nx + 2 * R; i += LANES)
             for (int m = 0; m < 3; ++m) {
                 vf s = 0.0f;
+                #pragma clang loop unroll(full)
                 for (int k = 0; k < 11; ++k) s += window[k] * *(const vf*)&a[m][(j + k) * STRIDE + i];
                 *(vf*)&down[m][i] = s;
             }
+        const int o = plane + (y0 + j) * width + x0;
+        __builtin_memcpy(row[0], &image.data[o], nx * sizeof(float));
+        __builtin_memcpy(row[1], &target.data[o], nx * sizeof(float));
         for (int i = 0; i < nx; i += LANES) {
-            vf f[3];
-            for (int m = 0; m < 3; ++m) {
-                f[m] = 0.0f;
-                for (int k = 0; k < 11; ++k) f[m] += window[k] * *(const vf*)&down[m][i + k];
-            }
-            const int o = plane + (y0 + j) * width + x0 + i, n = nx - i < LANES ? nx - i : LANES;
-            for (int l = 0; l < n; ++l) {
-                const float x = image.data[o + l], y = target.data[o + l];
-                const float sign = x > y ? 1.0f : x < y ? -1.0f : 0.0f;
-                v_image.data[o + l] = by_absolute * sign + by_ssim * (f[0][l] + 2.0f * x * f[1][l] + y * f[2][l]);
-            }
+            const vf x = *(const vf*)&row[0][i], y = *(const vf*)&row[1][i];
+            const vf sign = x > y ? (vf)1.0f : (x < y ? (vf)-1.0f : (vf)0.0f);
+            const vf mu = along(down[0] + i), xx = along(down[1] + i), xy = along(down[2] + i);
+            *(vf*)&row[2][i] = by_absolute * sign + by_ssim * (mu + 2.0f * x * xx + y * xy);
         }
+        __builtin_memcpy(&v_image.data[o], row[2], nx * sizeof(float));
     }
 #endif
 """
