@@ -80,7 +80,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         stop: real,
         cap: real,
         # Out:
-        image: wp.array3d[real],  # [5, H, W] red, green, blue, alpha, depth
+        image: wp.array3d[real],  # [3, H, W]
+        coverage: wp.array2d[real],  # [H, W]
+        depths: wp.array2d[real],  # [H, W] sum of weight times depth
         final_T: wp.array2d[real],  # [H, W]
         last: wp.array2d[wp.int32],  # [H, W] entry of items last accepted, -1 if none
     ):
@@ -109,8 +111,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         image[0, y, x] = red + T * background[0]
         image[1, y, x] = green + T * background[1]
         image[2, y, x] = blue + T * background[2]
-        image[3, y, x] = real(1.0) - T
-        image[4, y, x] = depth
+        coverage[y, x] = real(1.0) - T
+        depths[y, x] = depth
         final_T[y, x] = T
         last[y, x] = accepted
 
@@ -128,7 +130,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         cap: real,
         final_T: wp.array2d[real],  # [H, W]
         last: wp.array2d[wp.int32],  # [H, W]
-        v_image: wp.array3d[real],  # [5, H, W]
+        v_image: wp.array3d[real],  # [3, H, W]
+        v_coverage: wp.array2d[real],  # [H, W]
+        v_depths: wp.array2d[real],  # [H, W]
         # Out:
         partials: wp.array2d[real],  # [M, 10] zero at first
     ):
@@ -145,8 +149,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             v_red = v_image[0, y, x]
             v_green = v_image[1, y, x]
             v_blue = v_image[2, y, x]
-            v_depth = v_image[4, y, x]
-            behind = v_red * background[0] + v_green * background[1] + v_blue * background[2] - v_image[3, y, x]
+            v_depth = v_depths[y, x]
+            behind = v_red * background[0] + v_green * background[1] + v_blue * background[2] - v_coverage[y, x]
             accepted = last[y, x]
         # Every thread of the block walks the same entries: the block sums need all of them.
         for step in range(tile_end[tile] - tile_begin[tile]):

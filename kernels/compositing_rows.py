@@ -1,4 +1,4 @@
-"""Alpha compositing on a CPU: the same mathematics as ``compositing.py``, sixteen pixels of a row at a time.
+"""Alpha compositing on a CPU: the same mathematics as ``compositing.py``, eight pixels of a row at a time.
 
 A work item is one tile, so threads share nothing. A Gaussian visits only the rows and pixels inside its own ellipse:
 in row form (``projection.py``) the interval of a row is one square root. Native snippets spell out the vectors, which
@@ -15,7 +15,7 @@ TILE_WIDTH = 128
 TILE_HEIGHT = 16
 
 _COMMON = """
-    enum { LANES = 16, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES, SIZE = TH * STRIDE };
+    enum { LANES = 8, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES, SIZE = TH * STRIDE };
     typedef float vf __attribute__((ext_vector_type(LANES), aligned(4)));
     typedef int vi __attribute__((ext_vector_type(LANES), aligned(4)));
     vf lane;
@@ -132,8 +132,8 @@ _FORWARD = (
             image.data[o] = red[i] + T[i] * b0;
             image.data[plane + o] = green[i] + T[i] * b1;
             image.data[2 * plane + o] = blue[i] + T[i] * b2;
-            image.data[3 * plane + o] = 1.0f - T[i];
-            image.data[4 * plane + o] = depth[i];
+            coverage.data[o] = 1.0f - T[i];
+            depths.data[o] = depth[i];
             final_T.data[o] = T[i];
             last.data[o] = accepted[i];
         }
@@ -163,17 +163,15 @@ _BACKWARD = (
             v_red[i] = v_image.data[o];
             v_green[i] = v_image.data[plane + o];
             v_blue[i] = v_image.data[2 * plane + o];
-            v_depth[i] = v_image.data[4 * plane + o];
-            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_image.data[3 * plane + o];
+            v_depth[i] = v_depths.data[o];
+            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_coverage.data[o];
             accepted[i] = last.data[o];
             furthest = accepted[i] > furthest ? accepted[i] : furthest;
         }
     auto sum = [](vf v) -> float {
-        typedef float v8 __attribute__((ext_vector_type(8)));
-        typedef float v4 __attribute__((ext_vector_type(4)));
-        const v8 a = v.lo + v.hi;
-        const v4 b = a.lo + a.hi;
-        return (b[0] + b[2]) + (b[1] + b[3]);
+        typedef float v4 __attribute__((ext_vector_type(LANES / 2)));
+        const v4 half = v.lo + v.hi;
+        return (half[0] + half[2]) + (half[1] + half[3]);
     };
     for (int k = end - 1; k >= begin; --k) {
         const int item = items.data[k];
@@ -238,7 +236,7 @@ def _composite_tile(
     tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
     items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array[wp.float32], n_columns: int,
     width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
-    image: wp.array3d[wp.float32], final_T: wp.array2d[wp.float32], last: wp.array2d[wp.int32],
+    image: wp.array3d[wp.float32], coverage: wp.array2d[wp.float32], depths: wp.array2d[wp.float32], final_T: wp.array2d[wp.float32], last: wp.array2d[wp.int32],
 ): ...  # fmt: skip
 
 
@@ -247,7 +245,8 @@ def _composite_tile_bwd(
     tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
     items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array[wp.float32], n_columns: int,
     width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array2d[wp.float32],
-    last: wp.array2d[wp.int32], v_image: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
+    last: wp.array2d[wp.int32], v_image: wp.array3d[wp.float32], v_coverage: wp.array2d[wp.float32],
+    v_depths: wp.array2d[wp.float32], partials: wp.array2d[wp.float32],
 ): ...  # fmt: skip
 
 
@@ -266,13 +265,15 @@ def composite_rows_kernel(
     stop: wp.float32,
     cap: wp.float32,
     # Out:
-    image: wp.array3d[wp.float32],  # [5, H, W] red, green, blue, alpha, depth
+    image: wp.array3d[wp.float32],  # [3, H, W]
+    coverage: wp.array2d[wp.float32],  # [H, W]
+    depths: wp.array2d[wp.float32],  # [H, W] sum of weight times depth
     final_T: wp.array2d[wp.float32],  # [H, W]
     last: wp.array2d[wp.int32],  # [H, W] entry of items last accepted, -1 if none
 ):
     _composite_tile(
         first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        image.shape[2], image.shape[1], alpha_threshold, stop, cap, image, final_T, last,
+        image.shape[2], image.shape[1], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
     )  # fmt: skip
 
 
@@ -291,11 +292,13 @@ def composite_rows_bwd_kernel(
     cap: wp.float32,
     final_T: wp.array2d[wp.float32],  # [H, W]
     last: wp.array2d[wp.int32],  # [H, W]
-    v_image: wp.array3d[wp.float32],  # [5, H, W]
+    v_image: wp.array3d[wp.float32],  # [3, H, W]
+    v_coverage: wp.array2d[wp.float32],  # [H, W]
+    v_depths: wp.array2d[wp.float32],  # [H, W]
     # Out:
-    partials: wp.array2d[wp.float32],  # [M, 10] zero at first
+    partials: wp.array2d[wp.float32],  # [M, 10]
 ):
     _composite_tile_bwd(
         first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        v_image.shape[2], v_image.shape[1], alpha_threshold, cap, final_T, last, v_image, partials,
+        v_image.shape[2], v_image.shape[1], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths, partials,
     )  # fmt: skip

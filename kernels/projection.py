@@ -221,7 +221,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         v_opacities: wp.array[real],  # [N]
         v_colors: wp.array[vec3],  # [N]
         v_means2d: wp.array2d[real],  # [N, 2]
-        v_viewmats: wp.array2d[real],  # [N, 12] share of each Gaussian, or empty
+        v_viewmats: wp.array2d[wp.float64],  # [N, 12] share of each Gaussian, or empty
     ):
         n = first + wp.tid()
         count = n_items[n]
@@ -289,8 +289,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             v_view = v_g * wp.transpose(m) + wp.outer(v_p, mean)
             for i in range(3):
                 for j in range(3):
-                    v_viewmats[n, 4 * i + j] = real(v_view[i, j])
-                v_viewmats[n, 4 * i + 3] = real(v_p[i])
+                    v_viewmats[n, 4 * i + j] = v_view[i, j]
+                v_viewmats[n, 4 * i + 3] = v_p[i]
 
     return project_kernel, project_bwd_kernel
 

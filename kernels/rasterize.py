@@ -91,7 +91,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, settings: RasterSettings, size: tuple[int, int], screen_grads: Tensor | None, *tensors: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         tensors = tuple(tensor.contiguous() for tensor in tensors)
         means, quats, scales, opacities, colors, viewmat, K, background = tensors
         width, height = size
@@ -110,41 +110,40 @@ class _Rasterize(torch.autograd.Function):
                 projection.KERNELS[means.dtype][0], n, [*gaussians, *camera, *tile, *limits], [splats, tiles, keys]
             )
         lists = build_work_lists(keys, tiles, n_columns, n_rows)
-        image = means.new_empty(5, height, width)
-        final_T = means.new_empty(height, width)
+        image = means.new_empty(3, height, width)
+        coverage, depth, final_T = (means.new_empty(height, width) for _ in range(3))
         last = torch.empty(height, width, dtype=torch.int32, device=means.device)
         inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
         knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
+        outputs = [image, coverage, depth, final_T, last]
         n_tiles = n_columns * n_rows
         if form == "rows":
-            bridge.launch_ranges(
-                compositing_rows.composite_rows_kernel, n_tiles, [*inputs, *knobs], [image, final_T, last]
-            )
+            bridge.launch_ranges(compositing_rows.composite_rows_kernel, n_tiles, [*inputs, *knobs], outputs)
         else:
             kernel = compositing.KERNELS[means.dtype][0]
-            bridge.launch(kernel, n_tiles * compositing.BLOCK, [*inputs, *knobs], [image, final_T, last])
+            bridge.launch(kernel, n_tiles * compositing.BLOCK, [*inputs, *knobs], outputs)
         ctx.save_for_backward(*tensors, splats, final_T, last)
         ctx.lists, ctx.settings, ctx.size, ctx.form, ctx.screen_grads = lists, settings, size, form, screen_grads
         visible = lists.n_items > 0
         ctx.mark_non_differentiable(visible)
-        return image, visible
+        return image, coverage, depth, visible
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, _: Tensor) -> Any:
+    def backward(ctx: Any, v_image: Tensor, v_coverage: Tensor, v_depth: Tensor, _: Tensor) -> Any:
         *tensors, splats, final_T, last = ctx.saved_tensors
         means, quats, scales, opacities, colors, viewmat, K, background = tensors
         width, height = ctx.size
         lists: WorkLists = ctx.lists
         settings: RasterSettings = ctx.settings
-        v_image = v_image.contiguous()
+        v_planes = [v.contiguous() for v in (v_image, v_coverage, v_depth)]
         n_tiles = len(lists.tile_begin)
         rows = ctx.form == "rows"
         # The rows write every partial; the plain form adds up threads that run one after the other.
         partials = (means.new_empty if rows else means.new_zeros)(len(lists.items), 10)
         n_columns = -(-width // (compositing_rows.TILE_WIDTH if rows else compositing.TILE))
         inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
-        inputs += [settings.alpha_threshold, settings.alpha_cap, final_T, last, v_image]
+        inputs += [settings.alpha_threshold, settings.alpha_cap, final_T, last, *v_planes]
         if rows:
             bridge.launch_ranges(compositing_rows.composite_rows_bwd_kernel, n_tiles, inputs, [partials])
         else:
@@ -154,7 +153,8 @@ class _Rasterize(torch.autograd.Function):
         means2d = ctx.screen_grads if ctx.screen_grads is not None else means.new_empty(len(means), 2)
         means2d.zero_()
         wants_camera = ctx.needs_input_grad[8]
-        v_views = means.new_zeros(len(means) if wants_camera else 0, 12)
+        # In double precision: the camera's gradient is a sum over all Gaussians, which mostly cancels.
+        v_views = torch.zeros(len(means) if wants_camera else 0, 12, dtype=torch.float64, device=means.device)
         if len(means):
             camera = [viewmat[None], K[None], width, height, settings.low_pass]
             bridge.launch_ranges(
@@ -167,7 +167,7 @@ class _Rasterize(torch.autograd.Function):
         if wants_camera:
             v_viewmat = torch.zeros_like(viewmat)
             v_viewmat[:3] = v_views.sum(0).reshape(3, 4)
-        v_background = (v_image[:3] * final_T).sum((1, 2)) if ctx.needs_input_grad[10] else None
+        v_background = (v_image * final_T).sum((1, 2)) if ctx.needs_input_grad[10] else None
         return None, None, None, *grads, v_viewmat, None, v_background
 
 
@@ -213,5 +213,4 @@ def rasterize(
     background = means.new_zeros(3) if background is None else background
     tensors = (means, quats, scales, opacities, colors, viewmat, K, background)
     _check(len(means), tensors, *size, settings)
-    image, visible = _Rasterize.apply(settings, size, screen_grads, *tensors)
-    return Rendering(image[:3], image[3], image[4], visible)
+    return Rendering(*_Rasterize.apply(settings, size, screen_grads, *tensors))

@@ -90,17 +90,17 @@ def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -
     """
     n = len(keys)
     device = keys.device
-    n_items = (tiles[:, 1] - tiles[:, 0]).long() * (tiles[:, 3] - tiles[:, 2]).long()
+    n_items = (tiles[:, 1] - tiles[:, 0]) * (tiles[:, 3] - tiles[:, 2])
     order = bridge.sort_pairs(keys, torch.arange(n, dtype=torch.int32, device=device))[1]
-    ends = torch.cumsum(n_items[order.long()], 0)
+    in_order = n_items[order]
+    ends = torch.cumsum(in_order, 0, dtype=torch.int64)
     total = int(ends[-1]) if n else 0
     if total > MAX_ITEMS:
         raise ValueError(
             f"{total} pairs of tile and Gaussian are more than {MAX_ITEMS}: lower the image size, the number of "
             "Gaussians or their scales"
         )
-    offsets = (ends - n_items[order.long()]).int()
-    counts = n_items.int()
+    offsets = (ends - in_order).int()
     first_item = torch.zeros(n, dtype=torch.int32, device=device)
     item_tile, item_splat = torch.empty(2, total, dtype=torch.int32, device=device)
     bounds = torch.zeros(2, n_columns * n_rows, dtype=torch.int32, device=device)
@@ -110,4 +110,4 @@ def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -
         bits = max(1, (n_columns * n_rows - 1).bit_length())
         item_tile, items = bridge.sort_pairs(item_tile, items, bits=bits)
         bridge.launch(_tile_bounds_kernel, total, [item_tile], [bounds[0], bounds[1]])
-    return WorkLists(bounds[0], bounds[1], items, item_splat, first_item, counts)
+    return WorkLists(bounds[0], bounds[1], items, item_splat, first_item, n_items)

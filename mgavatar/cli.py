@@ -50,17 +50,28 @@ def _checked_capture(data: Path, principal_point: Literal["center", "opencv", "o
     return subject
 
 
-def demo(*, out: Path = Path("demo_out"), device: Device = "auto", seed: int = 0) -> None:
+def demo(
+    *,
+    out: Path = Path("demo_out"),
+    device: Device = "auto",
+    seed: int = 0,
+    preset: str = "quick",
+    config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008  frozen
+) -> None:
     """Make a synthetic capture, fit an avatar to it, drive it, score it and write a report.
 
     Args:
         out: New folder for everything.
         device: Where to compute.
         seed: Of the person and of the fit.
+        preset: As in fit.
+        config: As in fit.
     """
     from mgavatar.demo import run_demo
 
-    _say_notes(run_demo(out, device=_device(device), seed=seed))
+    configs.check(config)
+    _say_notes(_score_lines(run_demo(out, config, device=_device(device), seed=seed)))
+    print(out / "run" / "report.html")
 
 
 def synth(
@@ -304,7 +315,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 
 def _with_preset(argv: list[str]) -> list[str]:
     """Put a preset's values before the user's flags: one parser checks both, and the user's win."""
-    if argv[:1] != ["fit"] or "--help" in argv or "-h" in argv:
+    if argv[:1] not in (["fit"], ["demo"]) or "--help" in argv or "-h" in argv:
         return argv
     preset = "quick"
     for index, word in enumerate(argv):
@@ -312,7 +323,7 @@ def _with_preset(argv: list[str]) -> list[str]:
             preset = argv[index + 1]
         elif word.startswith("--preset="):
             preset = word.partition("=")[2]
-    return ["fit", *configs.preset_flags(configs.read_preset(preset)), *argv[1:]]
+    return [argv[0], *configs.preset_flags(configs.read_preset(preset)), *argv[1:]]
 
 
 def main() -> None:

@@ -127,7 +127,7 @@ class _Scorer:
 
     def __init__(self, avatar: Avatar, subject: Subject, lpips: Lpips | None) -> None:
         self.avatar, self.subject, self.lpips = avatar, subject, lpips
-        self.trivial = TrivialPredictors(avatar, subject)
+        self.trivial = TrivialPredictors(subject)
         self.seconds: list[float] = []
 
     def score(self, frame: Frame) -> dict[str, float | None]:
@@ -229,7 +229,9 @@ class _Truth:
 
     @staticmethod
     def read(path: Path, subject: Subject) -> _Truth:
-        arrays = read_npz(path, wanted=lambda key: key in ("vertices", "faces", "seen") or key.startswith("mask_")).arrays
+        arrays = read_npz(
+            path, wanted=lambda key: key in ("vertices", "faces", "seen") or key.startswith("mask_")
+        ).arrays
         if not {"vertices", "faces"} <= set(arrays):
             raise DataError(f"{path}: needs vertices (T, V, 3) and faces (F, 3)")
         vertices, faces = float_array(arrays["vertices"], where=f"{path}: vertices"), arrays["faces"]
@@ -245,7 +247,9 @@ class _Truth:
             if name not in ("vertices", "faces") and (values.shape != (n_verts,) or values.dtype.kind not in "biuf"):
                 raise DataError(f"{path}: {name} has shape {values.shape}, one value for each of {n_verts} is needed")
         seen = arrays["seen"] >= 3 if "seen" in arrays else np.ones(n_verts, bool)
-        masks = {name.removeprefix("mask_"): arrays[name].astype(bool) for name in sorted(arrays) if name[:5] == "mask_"}
+        masks = {
+            name.removeprefix("mask_"): arrays[name].astype(bool) for name in sorted(arrays) if name[:5] == "mask_"
+        }
         truth = _Truth(vertices, torch.tensor(faces.astype(np.int64)), seen, masks)
         if not truth.scored.any():
             raise DataError(f"{path}: mask_face and seen leave no vertex to score")

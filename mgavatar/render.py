@@ -72,7 +72,25 @@ def render_driving(
             add(avatar.render(pose, view, background), view)
             if progress is not None:
                 progress(index + 1, len(poses))
-    return driving_notes(avatar, driving, expression=expression)
+    return [*driving_notes(avatar, driving, expression=expression), *_view_notes(avatar, driving, poses, cameras)]
+
+
+def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:
+    """A line if the driven head leaves the picture."""
+    names = ("rotation", "neck", "translation")
+    places = head_points(avatar, *(np.stack([getattr(pose, name).numpy() for pose in poses]) for name in names))
+    outside = sum(not _sees(camera, place) for camera, place in zip(cameras, places, strict=True))
+    if not outside:
+        return []
+    return [
+        f"{driving.path}: the head is outside the picture in {outside} of {len(poses)} frames; "
+        "--head-motion neck keeps it in place"
+    ]
+
+
+def _sees(camera: Camera, place: np.ndarray) -> bool:
+    x, y, z = camera.K @ (camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3])
+    return bool(z > 0 and 0 <= x < z * camera.width and 0 <= y < z * camera.height)
 
 
 def driving_notes(avatar: Avatar, driving: Driving, *, expression: ExpressionMode = "auto") -> list[str]:
@@ -91,8 +109,8 @@ def poses_of(
 ) -> list[Pose]:
     """The avatar's poses under a driving sequence.
 
-    Rotations and expressions are taken as they are; translations are moved so that their mean is the avatar's own in
-    training, because a driving sequence comes from another place. ``"full"`` takes root and neck as driven. ``"neck"``
+    Rotations and expressions are taken as they are. ``"full"`` takes root and neck as driven, and moves the whole
+    sequence, which comes from another place, so that the head is on average where it was in training. ``"neck"``
     keeps the shoulders where they were on average in training and turns the neck by what root and neck turn together,
     so that the head looks where the driven one does. ``"none"`` keeps root and neck at their means in training.
 
@@ -109,10 +127,10 @@ def poses_of(
     mean = mean_pose(avatar)
     expr = _expression(avatar, driving, expression)[0]
     rotation, neck = driving.rotation, driving.neck_pose
-    still = mean.translation.numpy()
-    translation = driving.translation + (still - driving.translation.mean(axis=0))
-    if head_motion != "full":
-        translation = np.broadcast_to(still, translation.shape)
+    if head_motion == "full":
+        translation = driving.translation + _shift(avatar, driving, mean)
+    else:
+        translation = np.broadcast_to(mean.translation.numpy(), driving.translation.shape)
         own_root = Rotation.from_rotvec(mean.rotation.numpy())
         if head_motion == "neck":
             turned = Rotation.from_rotvec(rotation) * Rotation.from_rotvec(neck)
@@ -121,8 +139,28 @@ def poses_of(
             neck = np.broadcast_to(mean.neck.numpy(), neck.shape)
         rotation = np.broadcast_to(mean.rotation.numpy(), rotation.shape)
     columns = (expr, rotation, neck, driving.jaw_pose, driving.eyes_pose, translation)
-    tensors = [torch.tensor(np.ascontiguousarray(column[frames or slice(None)]), dtype=torch.float32) for column in columns]
+    tensors = [
+        torch.tensor(np.ascontiguousarray(column[frames or slice(None)]), dtype=torch.float32) for column in columns
+    ]
     return [Pose(*row) for row in zip(*tensors, strict=True)]
+
+
+def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """A point inside the head, between neck joint and eyes, in each of T poses [m], shape [T, 3]."""
+    head = avatar.head
+    with torch.no_grad():
+        joints = head.body.joints(head.canonical()).cpu().numpy().astype(np.float64)
+    root, top = joints[0], joints[1]
+    inside = (top + joints[3] + joints[4]) / 3.0
+    turned = top + Rotation.from_rotvec(neck).apply(inside - top)
+    return root + Rotation.from_rotvec(rotation).apply(turned - root) + translation
+
+
+def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
+    """What moves the driven head's mean place to the avatar's own [m], shape [3]."""
+    own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck, mean.translation)))
+    driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
+    return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)
 
 
 def mean_pose(avatar: Avatar) -> Pose:

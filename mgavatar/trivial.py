@@ -7,17 +7,19 @@ from functools import lru_cache
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
-from mgavatar.capture.subject import Frame, Subject
-from mgavatar.head.body import pose_of
+from mgavatar.capture.subject import Frame, HeadParams, Subject
 
 BEST_PSNR = 100.0
 """What equal images score [dB]: JSON has no infinity."""
 
-_POINTS = 500
+_ARM = 0.1
+"""How far from the head's centre rotations are felt [m]: a radian weighs as much as 0.1 m."""
+_EXPRESSION = 0.002
+"""What one unit of expression typically moves [m]."""
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -29,16 +31,14 @@ def psnr(image: Tensor, target: Tensor) -> float:
 class TrivialPredictors:
     """White, the mean training image, and the nearest training image, each scored as an avatar is.
 
-    The nearest image is that of the same camera in the pose whose head lies nearest: the mean distance between
-    vertices, so that angles, expressions and translations weigh what they move. A camera that training lacks is
-    replaced by the nearest one.
+    The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distance`. A camera that
+    training lacks is replaced by the nearest one.
     """
 
-    def __init__(self, avatar: Avatar, subject: Subject) -> None:
-        """Prepare for a capture; ``avatar`` lends its head to compare poses with."""
+    def __init__(self, subject: Subject) -> None:
+        self._params = subject.params
         self._train = subject.frames["train"]
         self._camera_positions = {frame.camera_id: frame.camera.position for frame in self._train}
-        self._points = _head_points(avatar, subject)
         self._read = lru_cache(maxsize=16)(_read_float)
         self._mean = lru_cache(maxsize=4)(self._mean_image)
 
@@ -62,17 +62,16 @@ class TrivialPredictors:
             return None
         camera_id = self._nearest_camera(frame, {other.camera_id for other in same_size})
         candidates = [other for other in same_size if other.camera_id == camera_id]
-        distances = [self._pose_distance(frame.timestep, other.timestep) for other in candidates]
+        distances = [pose_distance(self._params, frame.timestep, other.timestep) for other in candidates]
         return candidates[int(np.argmin(distances))]
 
     def _nearest_camera(self, frame: Frame, camera_ids: set[int]) -> int:
         if frame.camera_id in camera_ids:
             return frame.camera_id
         position = frame.camera.position
-        return min(sorted(camera_ids), key=lambda index: float(np.linalg.norm(self._camera_positions[index] - position)))
-
-    def _pose_distance(self, a: int, b: int) -> float:
-        return float((self._points[a] - self._points[b]).norm(dim=1).mean())
+        return min(
+            sorted(camera_ids), key=lambda index: float(np.linalg.norm(self._camera_positions[index] - position))
+        )
 
     def _mean_image(self, width: int, height: int) -> Tensor | None:
         """Mean of the training images of this size, [3, H, W], or None if there is none."""
@@ -89,15 +88,11 @@ def _read_float(frame: Frame) -> Tensor:
     return read_images([frame], threads=1)[0].float() / 255.0
 
 
-@torch.no_grad()
-def _head_points(avatar: Avatar, subject: Subject) -> Tensor:
-    """Some vertices of the head in every tracked pose [m], shape [T, P, 3], on the CPU."""
-    body = avatar.head.body
-    canonical = avatar.head.canonical()
-    joints = body.joints(canonical)
-    step = max(1, body.n_verts // _POINTS)
-    points = []
-    for timestep in range(len(subject.params)):
-        pose = pose_of(subject.params, timestep, body.model.n_expr).to(avatar.device)
-        points.append(body.posed(canonical, pose, joints=joints)[::step].cpu())
-    return torch.stack(points)
+def pose_distance(params: HeadParams, a: int, b: int) -> float:
+    """How far two heads are apart [m]: turn of root and neck together, jaw, translation, expression."""
+    head_a, head_b = (
+        Rotation.from_rotvec(params.rotation[t]) * Rotation.from_rotvec(params.neck_pose[t]) for t in (a, b)
+    )
+    turn = (head_a.inv() * head_b).magnitude() + float(np.linalg.norm(params.jaw_pose[a] - params.jaw_pose[b]))
+    moved = float(np.linalg.norm(params.translation[a] - params.translation[b]))
+    return _ARM * turn + moved + _EXPRESSION * float(np.linalg.norm(params.expr[a] - params.expr[b]))

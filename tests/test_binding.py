@@ -110,6 +110,16 @@ def test_collapsed_faces_stay_finite(device):
     assert scales[2:4].tolist() == pytest.approx([0.5, 0.5])
 
 
+def test_needles_do_not_throw_their_vertices(device):
+    """The normal's gradient grows as 1 / height; a height that is only rounding passes none."""
+    weights = torch.tensor([1.0, 2.0, 3.0, 4.0], device=device)
+    for height, least, most in ((1e-2, 20.0, 60.0), (1e-4, 2e3, 6e3), (1e-7, 0.1, 10.0)):
+        verts = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, height, 0.0]], device=device).requires_grad_()
+        quats, scales, centers = face_frames(verts, torch.tensor([[0, 1, 2]], device=device))
+        ((quats * weights).sum() + scales.sum() + centers.sum()).backward()
+        assert least < float(verts.grad.abs().max()) < most
+
+
 def test_nan_vertices_spoil_only_their_faces(device):
     """One vertex of a diverged fit does not reach the faces that do not use it."""
     verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [torch.nan] * 3], device=device)

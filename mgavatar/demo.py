@@ -1,0 +1,105 @@
+"""``mgavatar demo``: the whole way on a synthetic person, from nothing to a driven and scored avatar."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from mgavatar.avatar import Avatar
+from mgavatar.capture.images import check_images
+from mgavatar.capture.subject import Subject
+from mgavatar.capture.synthetic import make_synthetic_capture
+from mgavatar.capture.vhap import read_capture
+from mgavatar.config import FitConfig
+from mgavatar.driving import read_driving
+from mgavatar.errors import DataError
+from mgavatar.evaluate import evaluate, write_metrics
+from mgavatar.files import atomic_write
+from mgavatar.fit import fit, open_run
+from mgavatar.head.procedural import build_head
+from mgavatar.progress import Reporter
+from mgavatar.render import render_driving
+from mgavatar.report import write_report
+
+DRIVING_FRAMES = 60
+FPS = 25.0
+
+
+def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -> dict[str, Any]:
+    """Make a capture, fit, drive, score and report in a new folder.
+
+    Args:
+        out: Folder to make; it gets ``capture``, ``run``, ``driving.npz``, ``driven.mp4`` (or ``.gif`` without PyAV)
+            and ``metrics.json``.
+        config: Of the fit.
+        device: Where to compute.
+        seed: Of the person and of the fit.
+
+    Returns:
+        The scores, as ``evaluate`` gives them.
+
+    Raises:
+        DataError: If ``out`` exists and is not empty.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f"{out}: exists; give --out a new folder")
+    out.mkdir(parents=True, exist_ok=True)
+    head = build_head()
+    with Reporter("capture", 16 * 12) as reporter:
+        make_synthetic_capture(out / "capture", seed=seed, head=head, progress=lambda done, _: reporter.update(done))
+    subject = read_capture(out / "capture")
+    check_images(subject)
+    run = open_run(out / "run", resume=False)
+    avatar = fit(subject, head, config, run, device=device, seed=seed)
+    _drive(avatar, subject, out)
+    splits = ("val", "test")
+    with Reporter("evaluate", sum(len(subject.frames[name]) for name in splits)) as reporter:
+        metrics = evaluate(
+            avatar, subject, avatar_path=run.avatar, splits=splits, progress=lambda done, _: reporter.update(done)
+        )
+    write_metrics(out / "metrics.json", metrics)
+    write_report(run.folder, avatar, subject, metrics, history=run.metrics)
+    return metrics
+
+
+def _drive(avatar: Avatar, subject: Subject, out: Path) -> None:
+    """A talking, turning head: a driving file in VHAP's keys, and its film."""
+    path = out / "driving.npz"
+    with atomic_write(path) as file:
+        np.savez(file, **demo_motion(avatar))  # type: ignore[arg-type]
+    with Reporter("render", DRIVING_FRAMES) as reporter:
+        film = out / ("driven.mp4" if find_spec("av") else "driven.gif")
+        render_driving(avatar, read_driving(path), out=film, progress=lambda done, _: reporter.update(done))
+
+
+def demo_motion(avatar: Avatar) -> dict[str, np.ndarray]:
+    """A loop of speech, smile, blinks, a turning neck and wandering eyes, for the built-in head."""
+    t = np.linspace(0.0, 2.0 * np.pi, DRIVING_FRAMES, endpoint=False)
+    names = avatar.head_model.expr_names
+    expr = np.zeros((DRIVING_FRAMES, avatar.head_model.n_expr), np.float32)
+
+    def move(name: str, values: np.ndarray) -> None:
+        for side in (f"{name}_L", f"{name}_R"):
+            expr[:, names.index(side)] = values
+
+    move("smile", 0.6 * np.clip(np.sin(t), 0.0, 1.0))
+    move("brow_outer_up", 0.7 * np.clip(-np.sin(t), 0.0, 1.0))
+    move("blink", np.clip(6.0 * np.cos(2.0 * t + 0.6) - 5.0, 0.0, 1.0))
+    zero = np.zeros_like(t)
+    speech = 0.06 * (1.0 - np.cos(5.0 * t)) * (0.6 + 0.4 * np.cos(t))
+    turn = np.stack([0.10 * np.sin(2.0 * t), 0.30 * np.sin(t), 0.06 * np.sin(t + 1.0)], 1)
+    gaze = np.stack([0.05 * np.sin(3.0 * t), 0.20 * np.sin(2.0 * t + 0.5), zero], 1)
+    return {
+        "expr": expr,
+        "rotation": np.zeros((DRIVING_FRAMES, 3), np.float32),
+        "neck_pose": turn.astype(np.float32),
+        "jaw_pose": np.stack([speech, zero, zero], 1).astype(np.float32),
+        "eyes_pose": np.concatenate([gaze, gaze], 1).astype(np.float32),
+        "translation": np.zeros((DRIVING_FRAMES, 3), np.float32),
+        "fps": np.float32(FPS),
+        "expr_basis": np.array(avatar.head_model.expr_basis),
+    }
