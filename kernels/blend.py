@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype
 
-_BLOCK = 2048  # numbers that one CPU item adds up, so that they stay in the first-level cache
+_BLOCK = 4096  # numbers that one CPU item adds up, so that they stay in the first-level cache
 _LANES = 64  # partial sums of a dot product, the same on a CPU (vector lanes) and on CUDA (threads)
 
 # Four directions a pass: a sum is loaded and stored once for four products. Directions whose coefficient is exactly

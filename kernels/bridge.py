@@ -44,7 +44,7 @@ def _pool(n: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(n, thread_name_prefix="mgavatar-kernels")
 
 
-def _torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     if device.type != "cuda":
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
@@ -77,7 +77,7 @@ def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: Sequence[Any],
     """
     device = _device([*outputs, *inputs])
     arguments = _arguments(kernel, [*inputs, *outputs])
-    with _torch_stream(device):
+    with torch_stream(device):
         wp.launch(kernel, dim, inputs=arguments, device=str(device))
 
 
@@ -91,10 +91,10 @@ def launch_ranges(kernel: wp.Kernel, n_items: int, inputs: Sequence[Any], output
     arguments = _arguments(kernel, [*inputs, *outputs], first=1)
     threads = min(_n_threads, n_items)
     if device.type == "cuda" or threads <= 1:
-        with _torch_stream(device):
+        with torch_stream(device):
             wp.launch(kernel, n_items, inputs=[0, *arguments], device=str(device))
         return
-    kernel.module.load("cpu")
+    kernel.module.load("cpu", 1)  # the block size of CPU launches; another one would be a second build
     step = -(-n_items // (4 * threads))  # four ranges a thread: uneven items balance out
 
     def run(first: int) -> None:
@@ -115,7 +115,7 @@ class _TapeNode(torch.autograd.Function):
         needs_grad = ctx.needs_input_grad[3:]
         real = next((x.dtype for x in inputs if isinstance(x, Tensor) and x.is_floating_point()), torch.float32)
         outputs = tuple(torch.zeros(tuple(shape), device=device, dtype=real) for shape in shapes)
-        with _torch_stream(device), wp.Tape() as ctx.tape:
+        with torch_stream(device), wp.Tape() as ctx.tape:
             ctx.arrays = [_argument(x, t, requires_grad=n) for x, t, n in zip(inputs, declared, needs_grad, strict=False)]
             ctx.outputs = [
                 _argument(x, t, requires_grad=any(needs_grad)) for x, t in zip(outputs, declared[n_inputs:], strict=True)
@@ -129,7 +129,7 @@ class _TapeNode(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grads_out: Tensor) -> Any:
         _ = ctx.saved_tensors  # torch raises here if an input was changed in place since forward
-        with _torch_stream(grads_out[0].device):
+        with torch_stream(grads_out[0].device):
             ctx.tape.zero()
             grads = {out: to_warp(g.contiguous(), out.dtype) for out, g in zip(ctx.outputs, grads_out, strict=True)}
             ctx.tape.backward(grads=grads)
@@ -171,7 +171,7 @@ def sort_pairs(keys: Tensor, values: Tensor, *, bits: int = 32) -> tuple[Tensor,
     room_keys, room_values = keys.new_empty(2 * n), values.new_empty(2 * n)
     room_keys[:n], room_values[:n] = keys, values
     if n:
-        with _torch_stream(keys.device):
+        with torch_stream(keys.device):
             dtype = wp.float32 if keys.is_floating_point() else wp.int32
             wp.utils.radix_sort_pairs(to_warp(room_keys, dtype), to_warp(room_values, wp.int32), n, 0, bits)
     return room_keys[:n], room_values[:n]

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mgavatar.kernels.bridge import _torch_stream, launch_ranges, to_warp
+from mgavatar.kernels.bridge import torch_stream, launch_ranges, to_warp
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,7 +70,7 @@ class RayMesh:
         self._indices = faces.detach().reshape(-1).contiguous().clone()
         self._mesh: wp.Mesh | None = None
         if len(faces):
-            with _torch_stream(verts.device):
+            with torch_stream(verts.device):
                 self._mesh = wp.Mesh(to_warp(self._verts, wp.vec3), to_warp(self._indices, wp.int32))
 
     @property
@@ -89,7 +89,7 @@ class RayMesh:
         _check_finite(verts)
         self._verts.copy_(verts)
         if self._mesh is not None:
-            with _torch_stream(verts.device):
+            with torch_stream(verts.device):
                 self._mesh.refit()
 
     def cast(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:

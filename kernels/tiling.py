@@ -20,22 +20,25 @@ MAX_ITEMS = 2**31 - 1
 def _emit_kernel(
     # In:
     order: wp.array[wp.int32],  # [N] Gaussians by depth
-    offsets: wp.array[wp.int32],  # [N] first item of each Gaussian, in depth order
+    offsets: wp.array[wp.int32],  # [N] entries before each Gaussian, in depth order
+    first_item: wp.array[wp.int32],  # [N]
     tiles: wp.array2d[wp.int32],  # [N, 4]
     n_columns: int,
     # Out:
-    item_tile: wp.array[wp.int32],  # [M]
+    entry_tile: wp.array[wp.int32],  # [M] by depth
+    entry_item: wp.array[wp.int32],  # [M] by depth
     item_splat: wp.array[wp.int32],  # [M]
-    first_item: wp.array[wp.int32],  # [N]
 ):
     i = wp.tid()
     n = order[i]
-    item = offsets[i]
-    first_item[n] = item
+    entry = offsets[i]
+    item = first_item[n]
     for row in range(tiles[n, 2], tiles[n, 3]):
         for column in range(tiles[n, 0], tiles[n, 1]):
-            item_tile[item] = row * n_columns + column
+            entry_tile[entry] = row * n_columns + column
+            entry_item[entry] = item
             item_splat[item] = n
+            entry += 1
             item += 1
 
 
@@ -64,7 +67,7 @@ class WorkLists:
         tile_end: One past the last, shape [T], int32.
         items: Items grouped by tile, front to back, shape [M], int32.
         item_splat: Splat of each item, shape [M], int32.
-        first_item: First item of each splat; its items are consecutive, shape [N], int32.
+        first_item: First item of each splat; items are numbered splat after splat, shape [N], int32.
         n_items: Items of each splat, shape [N], int32.
     """
 
@@ -101,13 +104,14 @@ def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -
             "Gaussians or their scales"
         )
     offsets = (ends - in_order).int()
-    first_item = torch.zeros(n, dtype=torch.int32, device=device)
-    item_tile, item_splat = torch.empty(2, total, dtype=torch.int32, device=device)
+    # Numbered splat after splat, so that a splat's partial gradients lie together.
+    first_item = (torch.cumsum(n_items, 0, dtype=torch.int64) - n_items).int()
+    entry_tile, items, item_splat = torch.empty(3, total, dtype=torch.int32, device=device)
     bounds = torch.zeros(2, n_columns * n_rows, dtype=torch.int32, device=device)
-    items = torch.arange(total, dtype=torch.int32, device=device)
     if total:
-        bridge.launch(_emit_kernel, n, [order, offsets, tiles, n_columns], [item_tile, item_splat, first_item])
+        emitted = [entry_tile, items, item_splat]
+        bridge.launch(_emit_kernel, n, [order, offsets, first_item, tiles, n_columns], emitted)
         bits = max(1, (n_columns * n_rows - 1).bit_length())
-        item_tile, items = bridge.sort_pairs(item_tile, items, bits=bits)
-        bridge.launch(_tile_bounds_kernel, total, [item_tile], [bounds[0], bounds[1]])
+        entry_tile, items = bridge.sort_pairs(entry_tile, items, bits=bits)
+        bridge.launch(_tile_bounds_kernel, total, [entry_tile], [bounds[0], bounds[1]])
     return WorkLists(bounds[0], bounds[1], items, item_splat, first_item, n_items)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,13 +18,14 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, HeadParams, Split, Subject
 from mgavatar.errors import DataError
-from mgavatar.files import float_array, read_npz
+from mgavatar.files import atomic_write, float_array, read_npz
 from mgavatar.head.body import Pose, pose_of
 from mgavatar.kernels.closest_point import closest_points
 from mgavatar.losses import ssim
 from mgavatar.lpips import NO_WEIGHTS, Lpips, load_lpips
 from mgavatar.trivial import TrivialPredictors, psnr
 
+T = TypeVar("T")
 Progress = Callable[[int, int], None]
 
 TASKS: dict[Split, str] = {"train": "training-views", "val": "novel-view", "test": "self-reenactment"}
@@ -41,6 +43,7 @@ def evaluate(
     avatar_path: Path,
     splits: Sequence[Split],
     lpips_weights: Path | None = None,
+    max_frames: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score an avatar on a capture; the result is ``metrics.json``.
@@ -54,17 +57,19 @@ def evaluate(
         avatar_path: Where the avatar comes from, for the record.
         splits: What to score.
         lpips_weights: The state dict of ``lpips.LPIPS(net="vgg")``, or None.
+        max_frames: Score at most so many images of each split, spread over it; ``sampled_from`` then says of how many.
         progress: Called with the number of images scored and their total.
 
     Returns:
         ``avatar``, ``data``, ``device``; ``splits`` with ``psnr`` [dB], ``ssim``, ``lpips`` and, under ``trivial``, the
         PSNR [dB] of predictors that know nothing of heads; ``geometry`` or None; ``seconds_per_frame``, the median
-        time from pose to image. Scores of a split without images are None.
+        time from pose to image. Splits without images are left out, and so are trivial predictors that have nothing to
+        predict with.
 
     Raises:
         DataError: If no split has images, or a file is missing or damaged.
     """
-    frames = {split: subject.frames[split] for split in splits}
+    frames = {split: spread(subject.frames[split], max_frames) for split in splits if subject.frames[split]}
     total = sum(len(chosen) for chosen in frames.values())
     if not total:
         raise DataError(f"{subject.root}: no images in {', '.join(splits)}; choose another split")
@@ -81,6 +86,8 @@ def evaluate(
             if progress is not None:
                 progress(done, total)
         results[split] = _summary(split, chosen, scores, has_lpips=lpips is not None)
+        if len(chosen) < len(subject.frames[split]):
+            results[split]["sampled_from"] = len(subject.frames[split])
     return {
         "avatar": str(avatar_path),
         "data": str(subject.root),
@@ -89,6 +96,25 @@ def evaluate(
         "geometry": score_geometry(avatar, subject),
         "seconds_per_frame": float(np.median(scorer.seconds)),
     }
+
+
+def evaluate_sample(avatar: Avatar, subject: Subject, *, avatar_path: Path, max_frames: int = 24) -> dict[str, Any]:
+    """A quick score after a fit: some of the held-out images, or of the training images if none are held out."""
+    held_out: tuple[Split, ...] = tuple(split for split in ("val", "test") if subject.frames[split])
+    return evaluate(avatar, subject, avatar_path=avatar_path, splits=held_out or ("train",), max_frames=max_frames)
+
+
+def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
+    """Write ``metrics.json``; atomic."""
+    with atomic_write(path) as file:
+        file.write((json.dumps(metrics, indent=2) + "\n").encode())
+
+
+def spread(items: Sequence[T], count: int | None) -> tuple[T, ...]:
+    """At most ``count`` items, evenly spaced from the first to the last; all of them if None."""
+    if count is None or len(items) <= count:
+        return tuple(items)
+    return tuple(items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int))
 
 
 def is_own_capture(avatar: Avatar, subject: Subject) -> bool:
@@ -149,6 +175,7 @@ class _Scorer:
 def _summary(
     split: Split, frames: Sequence[Frame], scores: list[dict[str, float | None]], *, has_lpips: bool
 ) -> dict[str, Any]:
+    trivial = {name: _mean(scores, name) for name in ("white", "mean_image", "nearest_frame")}
     return {
         "task": TASKS[split],
         "frames": len(frames),
@@ -158,13 +185,13 @@ def _summary(
         "ssim": _mean(scores, "ssim"),
         "lpips": _mean(scores, "lpips"),
         "lpips_reason": None if has_lpips else NO_WEIGHTS,
-        "trivial": {name: _mean(scores, name) for name in ("white", "mean_image", "nearest_frame")},
+        "trivial": {name: value for name, value in trivial.items() if value is not None},
     }
 
 
 def _mean(scores: list[dict[str, float | None]], name: str) -> float | None:
     """Mean over the images that have this score."""
-    values = [score[name] for score in scores if score[name] is not None]
+    values = [value for score in scores if (value := score[name]) is not None]
     return float(np.mean(values)) if values else None
 
 
@@ -194,9 +221,8 @@ def score_geometry(avatar: Avatar, subject: Subject) -> dict[str, Any] | None:
     head = avatar.head
     faces = head.body.faces
     timesteps = sorted({frame.timestep for frame in subject.frames["train"]})
-    spread = np.linspace(0, len(timesteps) - 1, min(GEOMETRY_TIMESTEPS, len(timesteps))).round().astype(int)
     distances, angles = [], []
-    for timestep in (timesteps[index] for index in spread):
+    for timestep in spread(timesteps, GEOMETRY_TIMESTEPS):
         verts = avatar.verts(evaluation_pose(avatar, subject, timestep))
         points = torch.tensor(truth.vertices[subject.timestep_ids[timestep]])
         distance, angle = _compare(verts, faces, points, truth.faces)

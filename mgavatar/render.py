@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -234,18 +234,22 @@ def _train_camera(avatar: Avatar, name: str) -> Camera:
 
 
 def _orbit(avatar: Avatar, n_frames: int) -> list[Camera]:
-    """The mean camera carried rigidly around the head's own upright axis, back at its place in the end."""
+    """One swing of the mean camera to both sides of the head and back to its place."""
+    phases = np.arange(n_frames) / n_frames
+    return turned_cameras(avatar, avatar.capture.mean_camera(), ORBIT_DEGREES * np.sin(2.0 * math.pi * phases))
+
+
+def turned_cameras(avatar: Avatar, camera: Camera, yaws: Iterable[float]) -> list[Camera]:
+    """A camera carried rigidly around the upright axis of the head in its mean pose, by each yaw [degrees]."""
     pose = mean_pose(avatar)
-    view = avatar.capture.mean_camera()
     center = avatar.verts(pose).mean(dim=0).cpu().numpy().astype(np.float64)
     up = Rotation.from_rotvec(pose.rotation.numpy()).apply([0.0, 1.0, 0.0])
     cameras = []
-    for index in range(n_frames):
-        yaw = math.radians(ORBIT_DEGREES) * math.sin(2.0 * math.pi * index / n_frames)
+    for yaw in yaws:
         turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(-yaw * up).as_matrix()
+        turn[:3, :3] = Rotation.from_rotvec(-math.radians(yaw) * up).as_matrix()
         turn[:3, 3] = center - turn[:3, :3] @ center
-        cameras.append(replace(view, viewmat=view.viewmat @ turn))
+        cameras.append(replace(camera, viewmat=camera.viewmat @ turn))
     return cameras
 
 

@@ -141,7 +141,12 @@ class _Counter:
 def _mp4(path: Path, fps: float) -> Iterator[FrameSink]:
     """H.264 in yuv420p, which every player takes, with the colours declared as BT.709."""
     import av
+    from av.video.reformatter import Interpolation
 
+    # Without these swscale takes shortcuts that cost about half a level of brightness.
+    exact = (
+        Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
+    )
     rate = Fraction(fps).limit_denominator(1001)
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream: Any = container.add_stream("libx264", rate=rate, options={"crf": "16", "preset": "medium"})
@@ -156,7 +161,11 @@ def _mp4(path: Path, fps: float) -> Iterator[FrameSink]:
                 stream.height, stream.width = pixels.shape[:2]
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
             converted = frame.reformat(
-                format="yuv420p", src_color_range="JPEG", dst_color_range="MPEG", dst_colorspace="ITU709"
+                format="yuv420p",
+                src_color_range="JPEG",
+                dst_color_range="MPEG",
+                dst_colorspace="ITU709",
+                interpolation=exact,
             )
             container.mux(stream.encode(converted))
 

@@ -42,7 +42,7 @@ def joints_twin(joints, poses):
     return twins.joint_transforms(joints, poses, PARENTS)
 
 
-@pytest.mark.parametrize(("n_dirs", "n_verts"), [(1, 1), (3, 5), (7, 700), (60, 2001)])
+@pytest.mark.parametrize(("n_dirs", "n_verts"), [(1, 1), (3, 5), (7, 700), (60, 2001), (9, 3000)])
 def test_blend_shapes_match_the_float64_twin(device, rng, n_dirs, n_verts):
     """Any number of directions, in and out of whole passes and blocks."""
     assert_matches_twin(blend_shapes, twins.blend_shapes, directions(rng, n_dirs, n_verts), device=device)
