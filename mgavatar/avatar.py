@@ -154,7 +154,10 @@ class Avatar:
         payload = _read(path)
         try:
             config = from_dict(payload["config"])
-            arrays = {name: value.numpy() if isinstance(value, Tensor) else np.array(value) for name, value in payload["head"].items()}
+            arrays = {
+                name: value.numpy() if isinstance(value, Tensor) else np.array(value)
+                for name, value in payload["head"].items()
+            }
             body = Body(head_from_arrays(arrays, path=path), subdivisions=config.geometry.subdivisions, device=device)
             capture = _capture_of(payload["capture"])
             head = PersonalHead(body, capture.tracked, config.geometry)
@@ -226,7 +229,9 @@ def _capture_state(capture: CaptureInfo) -> dict[str, Any]:
     cameras = list(capture.cameras.values())
     tracked = {field.name: getattr(capture.tracked, field.name) for field in dataclasses.fields(HeadParams)}
     return {
-        "tracked": {name: None if value is None else torch.from_numpy(np.array(value)) for name, value in tracked.items()},
+        "tracked": {
+            name: None if value is None else torch.from_numpy(np.array(value)) for name, value in tracked.items()
+        },
         "timestep_ids": list(capture.timestep_ids),
         "train_timesteps": list(capture.train_timesteps),
         "camera_ids": list(capture.cameras),
@@ -238,7 +243,9 @@ def _capture_state(capture: CaptureInfo) -> dict[str, Any]:
 
 
 def _capture_of(state: dict[str, Any]) -> CaptureInfo:
-    tracked = {name: None if value is None else value.numpy() for name, value in state["tracked"].items()}
+    tracked: dict[str, Any] = {
+        name: None if value is None else value.numpy() for name, value in state["tracked"].items()
+    }
     viewmats, Ks = state["viewmats"].numpy(), state["Ks"].numpy()
     if not (np.isfinite(viewmats).all() and np.isfinite(Ks).all()):
         raise ValueError("a camera is not finite")
@@ -253,5 +260,3 @@ def _capture_of(state: dict[str, Any]) -> CaptureInfo:
 
 def _brief(error: Exception) -> str:
     return " ".join(str(error).split())[:160]
-
-

@@ -41,7 +41,13 @@ class Camera:
 
 
 def look_at(
-    position: np.ndarray, target: np.ndarray, *, focal: float, width: int, height: int, up: tuple[float, float, float] = (0.0, 1.0, 0.0)
+    position: np.ndarray,
+    target: np.ndarray,
+    *,
+    focal: float,
+    width: int,
+    height: int,
+    up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Camera:
     """A camera at ``position`` [m] that sees ``target`` [m] in the image centre, ``up`` upwards; ``focal`` in px."""
     forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)

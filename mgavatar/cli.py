@@ -182,7 +182,9 @@ def _capture_notes(subject: Any, head: Any) -> list[str]:
     notes = []
     for name, values, n in (("shape", subject.params.shape, head.n_shape), ("expr", subject.params.expr, head.n_expr)):
         if np.any(values[..., n:]):
-            notes.append(f"{subject.root}: {name} has {values.shape[-1]} columns, {head.name} takes {n}: the rest is cut")
+            notes.append(
+                f"{subject.root}: {name} has {values.shape[-1]} columns, {head.name} takes {n}: the rest is cut"
+            )
     return notes
 
 

@@ -216,7 +216,13 @@ def to_toml(config: Any, prefix: str = "") -> str:
         if dataclasses.is_dataclass(value):
             nested.append(f"\n[{prefix}{entry.name}]\n{to_toml(value, f'{prefix}{entry.name}.')}")
         else:
-            text = f'"{value}"' if isinstance(value, str) else str(value).lower() if isinstance(value, bool) else repr(value)
+            text = (
+                f'"{value}"'
+                if isinstance(value, str)
+                else str(value).lower()
+                if isinstance(value, bool)
+                else repr(value)
+            )
             plain.append(f"{entry.name} = {text}\n")
     return "".join(plain + nested)
 

@@ -11,7 +11,7 @@ import torch
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import check_images
-from mgavatar.capture.subject import Subject
+from mgavatar.capture.subject import Split, Subject
 from mgavatar.capture.synthetic import make_synthetic_capture
 from mgavatar.capture.vhap import read_capture
 from mgavatar.config import FitConfig
@@ -56,7 +56,7 @@ def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -
     run = open_run(out / "run", resume=False)
     avatar = fit(subject, head, config, run, device=device, seed=seed)
     _drive(avatar, subject, out)
-    splits = ("val", "test")
+    splits: tuple[Split, ...] = ("val", "test")
     with Reporter("evaluate", sum(len(subject.frames[name]) for name in splits)) as reporter:
         metrics = evaluate(
             avatar, subject, avatar_path=run.avatar, splits=splits, progress=lambda done, _: reporter.update(done)
@@ -100,6 +100,6 @@ def demo_motion(avatar: Avatar) -> dict[str, np.ndarray]:
         "jaw_pose": np.stack([speech, zero, zero], 1).astype(np.float32),
         "eyes_pose": np.concatenate([gaze, gaze], 1).astype(np.float32),
         "translation": np.zeros((DRIVING_FRAMES, 3), np.float32),
-        "fps": np.float32(FPS),
+        "fps": np.array(FPS, np.float32),
         "expr_basis": np.array(avatar.head_model.expr_basis),
     }

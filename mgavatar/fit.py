@@ -164,7 +164,9 @@ def fit(
         geometry.load_state_dict(checkpoint["geometry"])
     try:
         avatar = Avatar(vertex_gaussians, None, capture, config)
-        loop.run_stage(geometry, avatar, done=_done(checkpoint, geometry), state=lambda: {"geometry": geometry.state_dict()})
+        loop.run_stage(
+            geometry, avatar, done=_done(checkpoint, geometry), state=lambda: {"geometry": geometry.state_dict()}
+        )
 
         appearance = build_appearance(head, config, seed=seed)
         stage = AppearanceStage(appearance, config, seed=seed)
@@ -273,4 +275,3 @@ def _read_checkpoint(run: Run, config: FitConfig) -> dict[str, Any]:
     if stored != to_toml(config):
         raise DataError(f"{path}: was made with another configuration; give --preset {run.folder / 'config.toml'}")
     return checkpoint
-

@@ -34,7 +34,9 @@ class Reporter:
             self.live.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self.live:
             self.live.stop()
         if kind is None:
@@ -50,7 +52,11 @@ class Reporter:
         elif now - self.last >= _PLAIN_SECONDS:
             self.last = now
             left = (self.total - done) / max(rate, 1e-9)
-            print(f"{self.title} {done}/{self.total}  {rate:.1f}/s  {note}  {left:.0f} s left", file=sys.stderr, flush=True)
+            print(
+                f"{self.title} {done}/{self.total}  {rate:.1f}/s  {note}  {left:.0f} s left",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 class MetricsLog:

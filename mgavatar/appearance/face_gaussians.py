@@ -77,7 +77,9 @@ class FaceGaussians(nn.Module):
         self.uvs = self.uvs.new_zeros(n, 2)
 
 
-def face_uvs(local_means: Tensor, face_ids: Tensor, frames: FaceFrames, verts: Tensor, faces: Tensor, face_vt: Tensor) -> Tensor:
+def face_uvs(
+    local_means: Tensor, face_ids: Tensor, frames: FaceFrames, verts: Tensor, faces: Tensor, face_vt: Tensor
+) -> Tensor:
     """Texture coordinate under each Gaussian: its centre dropped onto its face along the normal, kept inside it.
 
     Args:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.appearance.color_net import ColorNet
-from mgavatar.appearance.face_gaussians import FaceFrames, FaceGaussians, face_uvs
+from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, FaceGaussians, face_uvs
 from mgavatar.appearance.offset_net import OffsetNet, Offsets
 from mgavatar.camera import Camera
 from mgavatar.config import FitConfig
@@ -145,7 +145,7 @@ class Appearance(nn.Module):
             The Gaussians ``G_r`` of Section 3.2, and ``O_map`` [13, H, W] for its regulariser, or None without it.
         """
         g = self.gaussians
-        means, quats, log_scales, logits = g.local_means, g.quats, g.log_scales, g.opacity_logits
+        means, quats, log_scales, logits = (getattr(g, name) for name in PARAMETERS)
         offsets = self._offsets(posed)
         if offsets is not None:
             delta = offsets[1]

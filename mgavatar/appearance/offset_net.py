@@ -63,7 +63,9 @@ class OffsetNet(nn.Module):
         )  # fmt: skip
         self.encode_pose = nn.Sequential(nn.Linear(N_THETA, c // 2), nn.LeakyReLU(0.1), nn.Linear(c // 2, c // 2))
         up = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
-        self.decoder = nn.Sequential(_conv(c + c // 2, c), up, _conv(c, c), up, _conv(c, c // 2), up, _conv(c // 2, c // 2))
+        self.decoder = nn.Sequential(
+            _conv(c + c // 2, c), up, _conv(c, c), up, _conv(c, c // 2), up, _conv(c // 2, c // 2)
+        )
         self.last = nn.Conv2d(c, N_OFFSETS, 3, padding=1)
         nn.init.zeros_(self.last.weight)
         assert self.last.bias is not None  # noqa: S101  for the type checker

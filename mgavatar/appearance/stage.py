@@ -59,9 +59,7 @@ class AppearanceStage:
         a, appearance = self.config.appearance, self.appearance
         gaussians, maps = appearance(appearance.frozen.at_timestep(timestep), camera)
         screen_grads = torch.zeros(len(gaussians.means), 2, device=target.device)
-        rendering = draw(
-            gaussians, camera, background=background, config=self.config.raster, screen_grads=screen_grads
-        )
+        rendering = draw(gaussians, camera, background=background, config=self.config.raster, screen_grads=screen_grads)
         image_term = image_loss(rendering.image, target, self.config.loss)
         g = appearance.gaussians
         binding_term = binding_loss(g.local_means, g.log_scales.exp(), rendering.visible, a)

@@ -50,14 +50,19 @@ class PersonalHead(nn.Module):
             "translation": params.translation,
         }
         self.poses = nn.ParameterDict(
-            {name: nn.Parameter(torch.tensor(value, dtype=torch.float32, device=device)) for name, value in tracked.items()}
+            {
+                name: nn.Parameter(torch.tensor(value, dtype=torch.float32, device=device))
+                for name, value in tracked.items()
+            }
         )
         template = torch.tensor(body.fine.v_template, device=device)
         self.refine = RefineNet(template, config).to(device)
 
     def pose(self, timestep: int) -> Pose:
         """Parameters of a timestep of the capture, as refined so far."""
-        return Pose(*(self.poses[name][timestep] for name in ("expr", "rotation", "neck", "jaw", "eyes", "translation")))
+        return Pose(
+            *(self.poses[name][timestep] for name in ("expr", "rotation", "neck", "jaw", "eyes", "translation"))
+        )
 
     def posed(self, pose: Pose) -> PosedHead:
         """Eq. 1 to 3, then expression, pose and skinning."""

@@ -15,13 +15,13 @@ N_POSE = 12
 
 def _mlp(n_in: int, hidden: int) -> nn.Sequential:
     """Four layers to a 3-vector; the last starts at zero, so training starts at the template."""
-    layers = nn.Sequential(
+    last = nn.Linear(hidden, 3)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(
         nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(),
-        nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, 3),
+        nn.Linear(hidden, hidden), nn.ReLU(), last,
     )  # fmt: skip
-    nn.init.zeros_(layers[-1].weight)
-    nn.init.zeros_(layers[-1].bias)
-    return layers
 
 
 class RefineNet(nn.Module):
@@ -42,7 +42,8 @@ class RefineNet(nn.Module):
         place = ((v_template - low) / (high - low).max()).cpu()
         pairs = ((0, 1), (1, 2), (2, 0))
         self._samplers: list[SparseMatrix] = [
-            uv_sampler(place[:, list(pair)].contiguous(), resolution, resolution).to(v_template.device) for pair in pairs
+            uv_sampler(place[:, list(pair)].contiguous(), resolution, resolution).to(v_template.device)
+            for pair in pairs
         ]
 
     def encode(self) -> Tensor:
@@ -57,8 +58,8 @@ class RefineNet(nn.Module):
         """Eq. 2: ``delta mu_pose`` [m] from neck, jaw and eye rotations [12], shape [V, 3]; zero if switched off."""
         if self.phi_pose is None:
             return torch.zeros(len(features), 3, device=features.device)
-        first = self.phi_pose[0]
+        weight, bias = self.phi_pose[0].parameters()
         n = features.shape[1]
         # The pose is the same for all vertices: its share of the first layer is one vector.
-        hidden = features @ first.weight[:, :n].T + (first.weight[:, n:] @ pose + first.bias)
+        hidden = features @ weight[:, :n].T + (weight[:, n:] @ pose + bias)
         return self.unit * self.phi_pose[1:](hidden)

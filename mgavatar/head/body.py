@@ -95,7 +95,7 @@ class Body:
         self.pose_dirs = self._tensor(np.moveaxis(model.posedirs, 2, 0))
         self.has_pose_dirs = bool(np.any(model.posedirs))
         self.J_regressor = self._tensor(model.J_regressor)
-        self.parents = torch.tensor(model.parents, dtype=torch.int32, device=self.device)
+        self.parents = torch.tensor(model.parents, dtype=torch.int32)  # read by the host
         self.lbs_weights = self._tensor(self.fine.lbs_weights)
         self.faces = torch.tensor(self.fine.faces, dtype=torch.int32, device=self.device)
 

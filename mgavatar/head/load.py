@@ -70,7 +70,7 @@ def head_arrays(model: HeadModel) -> dict[str, np.ndarray]:
 def save_head_model(path: Path, model: HeadModel) -> None:
     """Write a head model as the ``.npz`` that ``load_head_model`` reads."""
     with atomic_write(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **head_arrays(model))  # type: ignore[arg-type]
+        np.savez_compressed(file, allow_pickle=False, **head_arrays(model))
 
 
 def _basis_of_names(*names: str) -> str:
