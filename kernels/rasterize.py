@@ -74,8 +74,20 @@ def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, setting
         raise ValueError(f"image size must be positive, got {width} x {height}")
     if not 0.0 < settings.alpha_cap <= LARGEST_CAP:
         raise ValueError(f"alpha_cap must lie between 0 and {LARGEST_CAP}, got {settings.alpha_cap}")
-    if settings.near <= 0.0:
+    if not settings.near > 0.0:
         raise ValueError(f"near must be positive, got {settings.near}")
+    if not settings.low_pass >= 0.0:
+        raise ValueError(f"low_pass must be at least 0, got {settings.low_pass}")
+    for name in ("alpha_threshold", "stop"):
+        if not 0.0 <= getattr(settings, name) < 1.0:
+            raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(settings, name)}")
+
+
+def _check_screen_grads(screen_grads: Tensor, means: Tensor) -> None:
+    if tuple(screen_grads.shape) != (len(means), 2):
+        raise ValueError(f"screen_grads has shape {tuple(screen_grads.shape)}, needs {(len(means), 2)}")
+    if screen_grads.dtype != means.dtype or screen_grads.device != means.device or not screen_grads.is_contiguous():
+        raise ValueError(f"screen_grads must be contiguous, {means.dtype} and on {means.device}")
 
 
 def _form(settings: RasterSettings, means: Tensor) -> Form:
@@ -213,4 +225,6 @@ def rasterize(
     background = means.new_zeros(3) if background is None else background
     tensors = (means, quats, scales, opacities, colors, viewmat, K, background)
     _check(len(means), tensors, *size, settings)
+    if screen_grads is not None:
+        _check_screen_grads(screen_grads, means)
     return Rendering(*_Rasterize.apply(settings, size, screen_grads, *tensors))

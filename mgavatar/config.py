@@ -30,6 +30,8 @@ class GeometryConfig:
     """Geometry stage (Section 3.1): vertex-bound Gaussians move the mesh."""
 
     iterations: int = 100_000
+    max_image_size: int = 8192
+    """Larger images are reduced until their longer side has this many pixels; evaluation is always at full size."""
     subdivisions: int | Literal["auto"] = "auto"
     """Midpoint subdivisions of the head model; the paper goes from 5K to 20K vertices with one, and ``auto`` takes one
     unless the head has that many already."""
@@ -116,6 +118,8 @@ class AppearanceConfig:
     """Appearance stage (Section 3.2): face-bound Gaussians on the frozen mesh."""
 
     iterations: int = 240_000
+    max_image_size: int = 8192
+    """As in the geometry stage."""
     lr_means: float = 5e-3
     """Local centres, in units of the face's scale k."""
     lr_scales: float = 1.7e-2
@@ -153,8 +157,6 @@ class RasterConfig:
 class FitConfig:
     """A whole fit."""
 
-    image_scale: float = 1.0
-    """Images are reduced to this share of their size for fitting; evaluation is always at full size."""
     principal_point: Literal["center", "opencv", "opengl"] = "center"
     """Where the capture's principal point is: the centre (as GaussianAvatars assumes), or cx, cy counted from the
     top (opencv) or from the bottom (opengl)."""
@@ -253,8 +255,9 @@ def check(config: FitConfig) -> None:
     """
     g, a = config.geometry, config.appearance
     bounds = (
-        ("image-scale", config.image_scale, 0.01, 1.0),
         ("geometry.iterations", g.iterations, 1, 10_000_000),
+        ("geometry.max-image-size", g.max_image_size, 16, 65_536),
+        ("appearance.max-image-size", a.max_image_size, 16, 65_536),
         ("geometry.subdivisions", 0 if g.subdivisions == "auto" else g.subdivisions, 0, 3),
         ("geometry.triplane-resolution", g.triplane_resolution, 2, 1024),
         ("geometry.hidden", g.hidden, 1, 4096),

@@ -217,7 +217,7 @@ def score_geometry(avatar: Avatar, subject: Subject) -> dict[str, Any] | None:
     """
     if subject.ground_truth is None:
         return None
-    truth = _Truth.read(subject.ground_truth, subject)
+    truth = Truth.read(subject.ground_truth, subject)
     head = avatar.head
     faces = head.body.faces
     timesteps = sorted({frame.timestep for frame in subject.frames["train"]})
@@ -245,7 +245,7 @@ def _finite_mean(values: np.ndarray) -> float | None:
     return float(finite.mean()) if finite.size else None
 
 
-class _Truth:
+class Truth:
     """``ground_truth/*.npz``, checked."""
 
     def __init__(self, vertices: np.ndarray, faces: Tensor, seen: np.ndarray, masks: dict[str, np.ndarray]) -> None:
@@ -254,7 +254,7 @@ class _Truth:
         self.scored = self.regions.get("face", seen)
 
     @staticmethod
-    def read(path: Path, subject: Subject) -> _Truth:
+    def read(path: Path, subject: Subject) -> Truth:
         arrays = read_npz(
             path, wanted=lambda key: key in ("vertices", "faces", "seen") or key.startswith("mask_")
         ).arrays
@@ -276,7 +276,7 @@ class _Truth:
         masks = {
             name.removeprefix("mask_"): arrays[name].astype(bool) for name in sorted(arrays) if name[:5] == "mask_"
         }
-        truth = _Truth(vertices, torch.tensor(faces.astype(np.int64)), seen, masks)
+        truth = Truth(vertices, torch.tensor(faces.astype(np.int64)), seen, masks)
         if not truth.scored.any():
             raise DataError(f"{path}: mask_face and seen leave no vertex to score")
         return truth
@@ -288,7 +288,7 @@ def _within(faces: np.ndarray, n_verts: int) -> bool:
 
 def _compare(verts: Tensor, faces: Tensor, points: Tensor, point_faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Distances [m] from points to a mesh and angles [rad] between the normals there; NaN where there is none."""
-    truth_normals = _vertex_normals(points, point_faces).to(verts.device)
+    truth_normals = vertex_normals(points, point_faces).to(verts.device)
     points = points.to(verts.device)
     closest, face_ids = closest_points(verts, faces, points, reach=REACH)
     found = face_ids >= 0
@@ -305,7 +305,7 @@ def face_normals(verts: Tensor, faces: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=1), dim=1, eps=1e-30)
 
 
-def _vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
+def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
     """Unit normals of vertices, areas as weights, shape [V, 3]; zero where a vertex has no face."""
     a, b, c = verts[faces].unbind(1)
     doubled = torch.cross(b - a, c - a, dim=1)

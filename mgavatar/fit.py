@@ -57,10 +57,11 @@ class Views:
     timesteps: list[int]
 
     @staticmethod
-    def of(subject: Subject, scale: float) -> Views:
-        """Decode the training split, reduced to ``scale`` of its size."""
+    def of(subject: Subject, max_size: int) -> Views:
+        """Decode the training split, reduced until its longer side has at most ``max_size`` pixels."""
         frames = subject.frames["train"]
         first = frames[0].camera
+        scale = min(1.0, max_size / max(first.width, first.height))
         size = (max(1, round(first.width * scale)), max(1, round(first.height * scale)))
         cameras = [frame.camera.scaled(*size) for frame in frames]
         return Views(read_images(frames, size=size), cameras, [frame.timestep for frame in frames])
@@ -146,36 +147,37 @@ def fit(
         Interrupted: After Ctrl-C; the avatar as far as it came has been saved.
     """
     torch.manual_seed(seed)
-    views = Views.of(subject, config.image_scale)
-    background = torch.tensor(subject.background, device=device)
     checkpoint = _read_checkpoint(run, config) if resume else None
     run.folder.mkdir(parents=True, exist_ok=True)
     if checkpoint is None:
         (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
     capture = CaptureInfo.of(subject)
     log = MetricsLog(run.metrics)
-
+    loop = _Loop(config, run, log, torch.tensor(subject.background, device=device), seed)
     body = Body(head_model, subdivisions=config.geometry.subdivisions, device=device)
     head = PersonalHead(body, subject.params, config.geometry)
     vertex_gaussians = VertexGaussians(head, config)
-    loop = _Loop(views, background, run, config, log, device, seed)
-    geometry = GeometryStage(vertex_gaussians, config)
-    if checkpoint is not None:
-        geometry.load_state_dict(checkpoint["geometry"])
     try:
-        avatar = Avatar(vertex_gaussians, None, capture, config)
+        geometry = GeometryStage(vertex_gaussians, config)
+        if checkpoint is not None:
+            geometry.load_state_dict(checkpoint["geometry"])
         loop.run_stage(
-            geometry, avatar, done=_done(checkpoint, geometry), state=lambda: {"geometry": geometry.state_dict()}
+            geometry,
+            Views.of(subject, config.geometry.max_image_size),
+            Avatar(vertex_gaussians, None, capture, config),
+            done=_done(checkpoint, geometry),
+            state=lambda: {"geometry": geometry.state_dict()},
         )
+        finished = geometry.state_dict()
 
         appearance = build_appearance(head, config, seed=seed)
         stage = AppearanceStage(appearance, config, seed=seed)
         if checkpoint is not None and "appearance" in checkpoint:
             stage.load_state_dict(checkpoint["appearance"])
         avatar = Avatar(vertex_gaussians, appearance, capture, config)
-        finished = geometry.state_dict()
         loop.run_stage(
             stage,
+            Views.of(subject, config.appearance.max_image_size),
             avatar,
             done=_done(checkpoint, stage),
             state=lambda: {"geometry": finished, "appearance": stage.state_dict()},
@@ -213,34 +215,29 @@ class _StopRequest:
         signal.signal(signal.SIGINT, self.previous)
 
 
+@dataclass(frozen=True, eq=False)
 class _Loop:
     """Views in random order through a stage, with progress, log and checkpoints."""
 
-    def __init__(
-        self,
-        views: Views,
-        background: Tensor,
-        run: Run,
-        config: FitConfig,
-        log: MetricsLog,
-        device: torch.device,
-        seed: int,
-    ) -> None:
-        self.views, self.background, self.run, self.config, self.log = views, background, run, config, log
-        self.device = device
-        self.seed = seed
+    config: FitConfig
+    run: Run
+    log: MetricsLog
+    background: Tensor
+    seed: int
 
-    def run_stage(self, stage: Stage, avatar: Avatar, *, done: int, state: Callable[[], dict[str, Any]]) -> None:
-        order = ViewOrder(len(self.views.images), self.seed)
-        views = iter(order)
+    def run_stage(
+        self, stage: Stage, views: Views, avatar: Avatar, *, done: int, state: Callable[[], dict[str, Any]]
+    ) -> None:
+        """Iterations ``done`` + 1 to the last; ``state`` is what a checkpoint holds besides its place."""
+        order = iter(ViewOrder(len(views.images), self.seed))
         for _ in range(done):
-            next(views)
+            next(order)
         started = saved = time.monotonic()
         with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
             for iteration in range(done + 1, stage.iterations + 1):
-                view = next(views)
-                target = self.views.images[view].to(self.device).float() / 255.0
-                terms = stage.step(self.views.cameras[view], self.views.timesteps[view], target, self.background)
+                view = next(order)
+                target = views.images[view].to(self.background.device).float() / 255.0
+                terms = stage.step(views.cameras[view], views.timesteps[view], target, self.background)
                 if not np.isfinite(terms["loss"]):
                     raise DataError(
                         f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "

@@ -6,7 +6,7 @@ their formulas: no row form, no tiles, no hand-written adjoint.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -106,9 +106,12 @@ def rasterize(
     K: Tensor,
     size: tuple[int, int],
     settings: RasterSettings,
+    shift: Tensor | None = None,
 ) -> Tensor:
-    """Red, green, blue, coverage and depth, shape [5, H, W]."""
+    """Red, green, blue, coverage and depth, shape [5, H, W]; ``shift`` [px], shape [N, 2], moves the means in the image."""
     seen = project(means, quats, scales, opacities, viewmat, K, size, settings)
+    if shift is not None:
+        seen = replace(seen, means2d=seen.means2d + shift[seen.order])
     features = torch.cat([colors[seen.order], seen.depths[:, None]], 1)
     gaussians = (seen.means2d, seen.conics, opacities[seen.order], features, background)
     limits = (settings.alpha_threshold, settings.stop, settings.alpha_cap)

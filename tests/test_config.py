@@ -1,0 +1,299 @@
+"""Configs: the paper's numbers, presets, and their way through TOML and the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import tomllib
+from typing import Any
+
+import pytest
+import torch
+from torch import nn
+
+from mgavatar import cli
+from mgavatar.appearance.color_net import ColorNet
+from mgavatar.appearance.offset_net import N_OFFSETS, OffsetNet
+from mgavatar.config import (
+    AppearanceConfig,
+    ColorNetConfig,
+    FitConfig,
+    GeometryConfig,
+    OffsetNetConfig,
+    check,
+    from_dict,
+    preset_flags,
+    preset_names,
+    read_preset,
+    to_toml,
+)
+from mgavatar.errors import DataError
+from mgavatar.geometry.refine_net import RefineNet
+from mgavatar.head.body import Body
+from mgavatar.head.procedural import build_head
+
+PAPER = {
+    "loss.color": 0.8,  # lambda_c, Eq. 4 and 11
+    "loss.ssim": 0.2,  # lambda_m, Eq. 4 and 11
+    "geometry.iterations": 100_000,
+    "geometry.lr_refine": 1e-3,  # eta_geo
+    "geometry.lambda_offset": 10.0,  # lambda_o, Eq. 7
+    "geometry.lambda_laplacian": 1e5,  # lambda_l, Eq. 7
+    "geometry.hidden": 128,
+    "geometry.pose_offsets": True,
+    "appearance.iterations": 240_000,  # 340k in all
+    "appearance.lambda_position": 0.01,  # lambda_mu, Eq. 11
+    "appearance.lambda_scale": 1.0,  # lambda_s, Eq. 11
+    "appearance.epsilon_position": 1.0,  # epsilon_mu, Eq. 11
+    "appearance.epsilon_scale": 0.6,  # epsilon_s, Eq. 11
+    "appearance.color_net.lr": 1e-2,  # eta_color
+    "appearance.color_net.levels": 16,
+    "appearance.color_net.base_resolution": 16,
+    "appearance.color_net.max_resolution": 4096,
+    "appearance.color_net.hidden": 64,
+    "appearance.offset_net.enabled": True,
+    "appearance.offset_net.lr": 1e-4,  # eta_offset
+    "appearance.offset_net.regularize": 0.01,  # lambda_a, Eq. 11
+}
+
+
+def number(config: FitConfig, key: str) -> Any:
+    """The value at a dotted key."""
+    value: Any = config
+    for name in key.split("."):
+        value = getattr(value, name)
+    return value
+
+
+class Parsed(Exception):
+    """Ends the command as soon as its config is known."""
+
+
+def parsed(monkeypatch: pytest.MonkeyPatch, *argv: str) -> FitConfig:
+    """The config that ``mgavatar fit`` gets from a command line."""
+
+    def stop(config: FitConfig) -> None:
+        raise Parsed(config)
+
+    monkeypatch.setattr(cli.configs, "check", stop)
+    monkeypatch.setattr("sys.argv", ["mgavatar", "fit", "--data", "x", "--out", "y", *argv])
+    with pytest.raises(Parsed) as caught:
+        cli.main()
+    return caught.value.args[0]
+
+
+@pytest.mark.parametrize("key", PAPER)
+def test_the_default_is_the_papers_number(key):
+    """Every number that the paper states is what the program does when nobody says otherwise."""
+    assert number(FitConfig(), key) == PAPER[key]
+
+
+def test_the_paper_preset_changes_nothing():
+    """``--preset paper`` is the defaults."""
+    assert read_preset("paper") == {}
+
+
+def test_the_offset_networks_have_the_papers_layers():
+    """Phi_id and Phi_pose: four layers, 128 channels; three planes."""
+    net = RefineNet(torch.rand(5, 3), GeometryConfig())
+    assert len(net.planes) == 3
+    for mlp in (net.phi_id, net.phi_pose):
+        layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]
+        assert [layer.out_features for layer in layers] == [128, 128, 128, 3]
+
+
+def test_color_net_has_the_papers_layers():
+    """16 levels of 2 features from 16 to 4096 cells, the direction, then two layers with 64 channels between."""
+    net = ColorNet(torch.zeros(3), torch.ones(3), ColorNetConfig(log2_table_size=8), seed=0)
+    levels = net.grid.shape.table_levels()
+    assert net.grid.shape.features == 2
+    assert (len(levels), int(levels[0, 0]), int(levels[-1, 0])) == (16, 16, 4096)
+    layers = [layer for layer in net.mlp if isinstance(layer, nn.Linear)]
+    assert [(layer.in_features, layer.out_features) for layer in layers] == [(16 * 2 + 3, 64), (64, 3)]
+
+
+def test_offset_net_has_the_papers_layers():
+    """One layer embeds 9 map channels, eight extract, five decode to 13."""
+    net = OffsetNet(OffsetNetConfig(resolution=16))
+    count = {name: sum(isinstance(m, nn.Conv2d) for m in part.modules()) for name, part in net.named_children()}
+    assert (count["embed"], count["encoder"], count["decoder"] + count["last"]) == (1, 8, 5)
+    assert net.embed[0].in_channels == 9
+    assert net.last.out_channels == N_OFFSETS == 13
+
+
+def test_subdivision_gives_the_papers_mesh():
+    """5K vertices and 10K faces become 20K and 40K; a head that fine already stays."""
+    head = build_head()
+    body = Body(head, subdivisions="auto")
+    assert (round(len(head.v_template), -3), round(len(head.faces), -3)) == (5000, 10000)
+    assert (round(body.n_verts, -3), round(len(body.faces), -3)) == (20000, 40000)
+    fine = dataclasses.replace(body.fine)
+    assert Body(fine, subdivisions="auto").n_verts == body.n_verts
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_every_preset_is_read_and_can_work(name, monkeypatch):
+    """A preset that ships has only known keys, says what it says, and passes the checks."""
+    config = parsed(monkeypatch, "--preset", name)
+    check(config)
+
+    def compare(table: dict[str, Any], prefix: str = "") -> None:
+        for key, value in table.items():
+            if isinstance(value, dict):
+                compare(value, f"{prefix}{key}.")
+            else:
+                assert number(config, prefix + key) == value
+
+    compare(read_preset(name))
+
+
+def test_quick_and_paper_ship():
+    """The two presets that the documentation names."""
+    assert {"quick", "paper"} <= set(preset_names())
+
+
+def test_the_users_flags_win_over_the_preset(monkeypatch):
+    """Wherever the flag stands, and also over a preset that says the opposite of a switch."""
+    quick = read_preset("quick")["geometry"]["iterations"]
+    assert parsed(monkeypatch).geometry.iterations == quick
+    for argv in (["--geometry.iterations", "7", "--preset=quick"], ["--preset", "quick", "--geometry.iterations=7"]):
+        config = parsed(monkeypatch, *argv)
+        assert config.geometry.iterations == 7
+        assert config.geometry.hidden == read_preset("quick")["geometry"]["hidden"]
+
+
+def test_switches_and_choices_come_through_a_file(tmp_path, monkeypatch):
+    """Booleans, words, nested tables and both kinds of ``subdivisions``."""
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'principal_point = "opengl"\n[geometry]\npose_offsets = false\nsubdivisions = 0\n'
+        '[appearance.color_net]\nview_frame = "world"\n[appearance.offset_net]\nenabled = false\n'
+    )
+    config = parsed(monkeypatch, "--preset", str(path))
+    assert config.principal_point == "opengl"
+    assert config.geometry.pose_offsets is False
+    assert config.geometry.subdivisions == 0
+    assert config.appearance.color_net.view_frame == "world"
+    assert config.appearance.offset_net.enabled is False
+    assert parsed(monkeypatch, "--preset", str(path), "--geometry.pose-offsets").geometry.pose_offsets is True
+    assert parsed(monkeypatch, "--preset", "paper").geometry.subdivisions == "auto"
+
+
+def test_an_unknown_key_is_refused_with_a_suggestion(tmp_path, monkeypatch, capsys):
+    """A misspelt key never falls back to a default: exit 2, and the nearest key is named."""
+    path = tmp_path / "mine.toml"
+    path.write_text("[geometry]\nlr_refin = 1e-3\n")
+    with pytest.raises(SystemExit) as stop:
+        parsed(monkeypatch, "--preset", str(path))
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert "--geometry.lr-refin=0.001" in said
+    assert re.search(r"--geometry\.lr-refine\b", said)
+
+
+def test_a_value_of_another_type_is_refused(tmp_path, monkeypatch, capsys):
+    """A word where a number belongs."""
+    path = tmp_path / "mine.toml"
+    path.write_text('[geometry]\nhidden = "many"\n')
+    with pytest.raises(SystemExit) as stop:
+        parsed(monkeypatch, "--preset", str(path))
+    assert stop.value.code == 2
+    assert "hidden" in capsys.readouterr().err
+
+
+def test_toml_round_trip(tmp_path, monkeypatch):
+    """``RUN/config.toml`` given back as a preset is the same fit, to the last digit."""
+    config = FitConfig(
+        image_scale=1.0 / 3.0,
+        principal_point="opencv",
+        geometry=GeometryConfig(lr_pose=1.2345678901234567e-5, pose_offsets=False, subdivisions=2),
+        appearance=AppearanceConfig(offset_net=OffsetNetConfig(enabled=False), epsilon_scale=0.1 + 0.2),
+    )
+    path = tmp_path / "config.toml"
+    path.write_text(to_toml(config))
+    assert from_dict(tomllib.loads(path.read_text())) == config
+    assert parsed(monkeypatch, "--preset", str(path)) == config
+    path.write_text(to_toml(FitConfig()))
+    assert parsed(monkeypatch, "--preset", str(path)) == FitConfig()
+
+
+def test_dict_round_trip():
+    """The config that an avatar carries comes back equal."""
+    config = FitConfig(log_every=3, geometry=GeometryConfig(hidden=5), appearance=AppearanceConfig(iterations=9))
+    assert from_dict(dataclasses.asdict(config)) == config
+    assert from_dict({}) == FitConfig()
+
+
+@pytest.mark.parametrize("table", [{"image_scal": 1.0}, {"geometry": {"hiden": 1}}, {"appearance": {"density": {"x": 1}}}])
+def test_a_stored_config_with_an_unknown_key_is_refused(table):
+    """At any depth."""
+    with pytest.raises(ValueError, match="unknown key"):
+        from_dict(table)
+
+
+def test_flags_of_a_table():
+    """Nested keys, switches at both depths, strings and numbers."""
+    table = {"a_b": 1, "on": True, "off": False, "c": {"d_e": "x", "off": False, "f": {"g": 1e-5}}}
+    assert preset_flags(table) == ["--a-b=1", "--on", "--no-off", "--c.d-e=x", "--c.no-off", "--c.f.g=1e-05"]
+
+
+@pytest.mark.parametrize(
+    ("preset", "text", "words"),
+    [
+        ("nothing", None, ("nothing", "quick", "paper", ".toml")),
+        ("absent.toml", None, ("absent.toml", "no such file", "quick")),
+        ("broken.toml", b"[geometry\niterations = 3", ("broken.toml", "not a TOML file")),
+        ("bytes.toml", b"\xff\xfe\x00", ("bytes.toml", "not a TOML file")),
+    ],
+)
+def test_a_preset_that_cannot_be_read(preset, text, words, tmp_path, monkeypatch):
+    """One line that names it and says what there is."""
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / preset).write_bytes(text)
+    with pytest.raises(DataError) as error:
+        read_preset(preset)
+    for word in words:
+        assert word in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "flag"),
+    [
+        (None, "image_scale", 0.0, "--image-scale"),
+        (None, "image_scale", 1.5, "--image-scale"),
+        (None, "image_scale", float("nan"), "--image-scale"),
+        (None, "log_every", 0, "--log-every"),
+        ("geometry", "iterations", 0, "--geometry.iterations"),
+        ("geometry", "subdivisions", 4, "--geometry.subdivisions"),
+        ("geometry", "subdivisions", -1, "--geometry.subdivisions"),
+        ("geometry", "triplane_resolution", 1, "--geometry.triplane-resolution"),
+        ("geometry", "hidden", 0, "--geometry.hidden"),
+        ("geometry", "final_lr", 0.0, "--geometry.final-lr"),
+        ("geometry", "initial_scale", 0.0, "--geometry.initial-scale"),
+        ("appearance", "iterations", 0, "--appearance.iterations"),
+        ("appearance", "final_lr", 2.0, "--appearance.final-lr"),
+        ("appearance", "initial_opacity", 1.0, "--appearance.initial-opacity"),
+        ("appearance.color_net", "levels", 0, "--appearance.color-net.levels"),
+        ("appearance.color_net", "log2_table_size", 25, "--appearance.color-net.log2-table-size"),
+        ("appearance.color_net", "max_resolution", 8, "--appearance.color-net.max-resolution"),
+        ("appearance.offset_net", "resolution", 8, "--appearance.offset-net.resolution"),
+        ("appearance.offset_net", "resolution", 60, "multiple of 8"),
+        ("appearance.density", "every", 0, "--appearance.density.every"),
+        ("raster", "alpha_threshold", -0.1, "--raster.alpha-threshold"),
+        ("raster", "stop", 0.6, "--raster.stop"),
+    ],
+)
+def test_numbers_that_cannot_work_are_refused(section, key, value, flag):
+    """Each by the name of its flag, before any work."""
+    table: dict[str, Any] = {key: value}
+    for name in reversed((section or "").split(".") if section else []):
+        table = {name: table}
+    with pytest.raises(DataError, match=re.escape(flag)):
+        check(from_dict(table))
+
+
+def test_the_defaults_pass_the_checks():
+    """What ships can work."""
+    check(FitConfig())
