@@ -166,7 +166,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
                     active = True
                     T = wp.min(T / (real(1.0) - alpha), real(1.0))
                     weight = alpha * T
-                    seen = v_red * splats[n, 8] + v_green * splats[n, 9] + v_blue * splats[n, 10] + v_depth * splats[n, 11]
+                    seen = (
+                        v_red * splats[n, 8] + v_green * splats[n, 9] + v_blue * splats[n, 10] + v_depth * splats[n, 11]
+                    )
                     v_alpha = T * (seen - behind)
                     behind = alpha * seen + (real(1.0) - alpha) * behind
                     grad[6] = weight * v_red

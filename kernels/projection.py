@@ -38,7 +38,6 @@ GRADIENT = ("mean_x", "mean_y", "curvature", "shear", "inv_var_y", "opacity", "r
 """Columns of a splat's gradient."""
 
 
-
 @wp.func
 def _rotation_of(q: wp.vec4d) -> wp.mat33d:
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -164,7 +163,12 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         # Outside these the footprint does not fit into single precision.
         if not (det > tiny) or not (var_x < one / tiny) or not (var_y < one / tiny):
             return
-        if not (var_y > tiny) or not (det > tiny * var_y) or not (wp.abs(mx) < one / tiny) or not (wp.abs(my) < one / tiny):
+        if (
+            not (var_y > tiny)
+            or not (det > tiny * var_y)
+            or not (wp.abs(mx) < one / tiny)
+            or not (wp.abs(my) < one / tiny)
+        ):
             return
         reach = wp.float64(NO_EXTENT)
         if alpha_threshold > zero:

@@ -99,68 +99,110 @@ def _form(settings: RasterSettings, means: Tensor) -> Form:
     return settings.form
 
 
+@dataclass(frozen=True)
+class Work:
+    """Projected Gaussians and who blends them, between the two halves of the rasterizer.
+
+    Attributes:
+        splats: Footprints, columns ``projection.SPLAT``, shape [N, 16].
+        lists: Depth-sorted splats of each tile.
+        form: ``plain`` or ``rows``.
+        n_columns: Tiles across the image.
+        size: Image width and height [px].
+    """
+
+    splats: Tensor
+    lists: WorkLists
+    form: Form
+    n_columns: int
+    size: tuple[int, int]
+
+    @property
+    def n_tiles(self) -> int:
+        """Tiles of the image."""
+        return len(self.lists.tile_begin)
+
+    @property
+    def inputs(self) -> list[Any]:
+        """What both directions of the blending read."""
+        lists = self.lists
+        return [self.splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat]
+
+
+def project(settings: RasterSettings, size: tuple[int, int], tensors: tuple[Tensor, ...]) -> Work:
+    """Find each Gaussian's footprint and list the tiles' work; ``tensors`` are checked and in the order of the op."""
+    *gaussians, viewmat, K, _ = tensors
+    means = gaussians[0]
+    width, height = size
+    form = _form(settings, means)
+    tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
+    n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
+    n = len(means)
+    splats = means.new_empty(n, 16)
+    tiles = torch.empty(n, 4, dtype=torch.int32, device=means.device)
+    keys = torch.empty(n, dtype=torch.float32, device=means.device)
+    if n:
+        inputs = [*gaussians, viewmat[None], K[None], width, height, *tile]
+        inputs += [settings.near, settings.low_pass, settings.alpha_threshold]
+        bridge.launch_ranges(projection.KERNELS[means.dtype][0], n, inputs, [splats, tiles, keys])
+    return Work(splats, build_work_lists(keys, tiles, n_columns, n_rows), form, n_columns, size)
+
+
+def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tensor]:
+    """Composite: image [3, H, W], coverage, depth, final T [H, W] and the last entry that each pixel accepted."""
+    width, height = work.size
+    image = background.new_empty(3, height, width)
+    planes = [background.new_empty(height, width) for _ in range(3)]
+    outputs = [image, *planes, torch.empty(height, width, dtype=torch.int32, device=background.device)]
+    knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
+    inputs = [*work.inputs, background, work.n_columns, *knobs]
+    if work.form == "rows":
+        bridge.launch_ranges(compositing_rows.composite_rows_kernel, work.n_tiles, inputs, outputs)
+    else:
+        bridge.launch(compositing.KERNELS[background.dtype][0], work.n_tiles * compositing.BLOCK, inputs, outputs)
+    return outputs
+
+
+def blend_backward(
+    settings: RasterSettings, work: Work, background: Tensor, final_T: Tensor, last: Tensor, v_planes: list[Tensor]
+) -> Tensor:
+    """Gradient of each item's splat, columns ``projection.GRADIENT``, shape [M, 10]."""
+    rows = work.form == "rows"
+    # The rows write every item; the plain form on a CPU adds up threads that run one after the other.
+    partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.items), 10)
+    inputs = [*work.inputs, background, work.n_columns, settings.alpha_threshold, settings.alpha_cap, final_T, last]
+    inputs += v_planes
+    if rows:
+        bridge.launch_ranges(compositing_rows.composite_rows_bwd_kernel, work.n_tiles, inputs, [partials])
+    else:
+        kernel = compositing.KERNELS[background.dtype][1]
+        bridge.launch(kernel, work.n_tiles * compositing.BLOCK, inputs, [partials])
+    return partials
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, settings: RasterSettings, size: tuple[int, int], screen_grads: Tensor | None, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         tensors = tuple(tensor.contiguous() for tensor in tensors)
-        means, quats, scales, opacities, colors, viewmat, K, background = tensors
-        width, height = size
-        n = len(means)
-        form = _form(settings, means)
-        tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
-        n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
-        splats = means.new_empty(n, 16)
-        tiles = torch.empty(n, 4, dtype=torch.int32, device=means.device)
-        keys = torch.empty(n, dtype=torch.float32, device=means.device)
-        camera = (viewmat[None], K[None], width, height)
-        limits = (settings.near, settings.low_pass, settings.alpha_threshold)
-        if n:
-            gaussians = (means, quats, scales, opacities, colors)
-            bridge.launch_ranges(
-                projection.KERNELS[means.dtype][0], n, [*gaussians, *camera, *tile, *limits], [splats, tiles, keys]
-            )
-        lists = build_work_lists(keys, tiles, n_columns, n_rows)
-        image = means.new_empty(3, height, width)
-        coverage, depth, final_T = (means.new_empty(height, width) for _ in range(3))
-        last = torch.empty(height, width, dtype=torch.int32, device=means.device)
-        inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
-        knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
-        outputs = [image, coverage, depth, final_T, last]
-        n_tiles = n_columns * n_rows
-        if form == "rows":
-            bridge.launch_ranges(compositing_rows.composite_rows_kernel, n_tiles, [*inputs, *knobs], outputs)
-        else:
-            kernel = compositing.KERNELS[means.dtype][0]
-            bridge.launch(kernel, n_tiles * compositing.BLOCK, [*inputs, *knobs], outputs)
-        ctx.save_for_backward(*tensors, splats, final_T, last)
-        ctx.lists, ctx.settings, ctx.size, ctx.form, ctx.screen_grads = lists, settings, size, form, screen_grads
-        visible = lists.n_items > 0
+        work = project(settings, size, tensors)
+        image, coverage, depth, final_T, last = blend(settings, work, tensors[-1])
+        ctx.save_for_backward(*tensors, final_T, last)
+        ctx.work, ctx.settings, ctx.screen_grads = work, settings, screen_grads
+        visible = work.lists.n_items > 0
         ctx.mark_non_differentiable(visible)
         return image, coverage, depth, visible
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_coverage: Tensor, v_depth: Tensor, _: Tensor) -> Any:
-        *tensors, splats, final_T, last = ctx.saved_tensors
-        means, quats, scales, opacities, colors, viewmat, K, background = tensors
-        width, height = ctx.size
-        lists: WorkLists = ctx.lists
+        *tensors, final_T, last = ctx.saved_tensors
+        means, quats, scales, _, _, viewmat, K, background = tensors
+        work: Work = ctx.work
         settings: RasterSettings = ctx.settings
         v_planes = [v.contiguous() for v in (v_image, v_coverage, v_depth)]
-        n_tiles = len(lists.tile_begin)
-        rows = ctx.form == "rows"
-        # The rows write every partial; the plain form adds up threads that run one after the other.
-        partials = (means.new_empty if rows else means.new_zeros)(len(lists.items), 10)
-        n_columns = -(-width // (compositing_rows.TILE_WIDTH if rows else compositing.TILE))
-        inputs = [splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat, background, n_columns]
-        inputs += [settings.alpha_threshold, settings.alpha_cap, final_T, last, *v_planes]
-        if rows:
-            bridge.launch_ranges(compositing_rows.composite_rows_bwd_kernel, n_tiles, inputs, [partials])
-        else:
-            kernel = compositing.KERNELS[means.dtype][1]
-            bridge.launch(kernel, n_tiles * compositing.BLOCK, inputs, [partials])
+        partials = blend_backward(settings, work, background, final_T, last, v_planes)
         grads = [torch.zeros_like(tensor) for tensor in tensors[:5]]
         means2d = ctx.screen_grads if ctx.screen_grads is not None else means.new_empty(len(means), 2)
         means2d.zero_()
@@ -168,13 +210,10 @@ class _Rasterize(torch.autograd.Function):
         # In double precision: the camera's gradient is a sum over all Gaussians, which mostly cancels.
         v_views = torch.zeros(len(means) if wants_camera else 0, 12, dtype=torch.float64, device=means.device)
         if len(means):
-            camera = [viewmat[None], K[None], width, height, settings.low_pass]
-            bridge.launch_ranges(
-                projection.KERNELS[means.dtype][1],
-                len(means),
-                [means, quats, scales, *camera, lists.first_item, lists.n_items, partials],
-                [*grads, means2d, v_views],
-            )
+            inputs = [means, quats, scales, viewmat[None], K[None], *work.size, settings.low_pass]
+            inputs += [work.lists.first_item, work.lists.n_items, partials]
+            kernel = projection.KERNELS[means.dtype][1]
+            bridge.launch_ranges(kernel, len(means), inputs, [*grads, means2d, v_views])
         v_viewmat = None
         if wants_camera:
             v_viewmat = torch.zeros_like(viewmat)

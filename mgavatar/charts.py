@@ -55,7 +55,7 @@ def loss_chart(lines: Sequence[Line], *, title: str) -> str:
     curves = {name: curve for name in _terms(lines) if len(curve := _curve(lines, name))}
     if not curves:
         return f"<p>{escape(title)}: no losses were logged.</p>"
-    last = max(float(curve[-1, 0]) for curve in curves.values())
+    last = max(float(line["iteration"]) for line in lines)
     values = np.concatenate([curve[:, 1] for curve in curves.values()])
     low, high = _decades(values)
 
@@ -79,9 +79,9 @@ def loss_chart(lines: Sequence[Line], *, title: str) -> str:
 
 
 def _terms(lines: Sequence[Line]) -> list[str]:
-    """Names of the numbers that were logged, the total first."""
+    """Names of the numbers that were logged; what all stages have comes first, and so has the same colour in all."""
     names = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
-    return sorted(names - _NOT_LOSSES, key=lambda name: (name != "loss", name))
+    return sorted(names - _NOT_LOSSES, key=lambda name: (name != "loss", name != "image", name))
 
 
 def _curve(lines: Sequence[Line], name: str) -> np.ndarray:

@@ -47,7 +47,8 @@ p { margin: 4px 0 12px; } .quiet, figcaption { color: var(--quiet); font-size: 0
 .cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(135px, 1fr)); gap: 12px; margin-top: 20px; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 12px 14px; }
 .card { color: var(--quiet); font-size: 0.9rem; }
-.card b { display: block; color: var(--text); white-space: nowrap; font-size: 1.35rem; font-variant-numeric: tabular-nums; line-height: 1.3; }
+.card b { display: block; color: var(--text); white-space: nowrap; font-size: 1.35rem; line-height: 1.3;
+  font-variant-numeric: tabular-nums; }
 figure { margin: 0 0 18px; } figure img { display: block; max-width: 100%; height: auto; border-radius: 6px; }
 figcaption { margin-top: 4px; }
 .columns { display: grid; font-size: 0.9rem; color: var(--quiet); max-width: 100%; margin-bottom: 2px; }

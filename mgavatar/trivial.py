@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from mgavatar.capture.subject import Frame, HeadParams, Subject
 BEST_PSNR = 100.0
 """What equal images score [dB]: JSON has no infinity."""
 
+_AT_ONCE = 16
 _ARM = 0.1
 """How far from the head's centre rotations are felt [m]: a radian weighs as much as 0.1 m."""
 _EXPRESSION = 0.002
@@ -31,14 +32,14 @@ def psnr(image: Tensor, target: Tensor) -> float:
 class TrivialPredictors:
     """White, the mean training image, and the nearest training image, each scored as an avatar is.
 
-    The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distance`. A camera that
+    The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distances`. A camera that
     training lacks is replaced by the nearest one.
     """
 
     def __init__(self, subject: Subject) -> None:
-        self._params = subject.params
         self._train = subject.frames["train"]
         self._camera_positions = {frame.camera_id: frame.camera.position for frame in self._train}
+        self._distances = lru_cache(maxsize=64)(partial(pose_distances, subject.params))
         self._read = lru_cache(maxsize=16)(_read_float)
         self._mean = lru_cache(maxsize=4)(self._mean_image)
 
@@ -62,8 +63,8 @@ class TrivialPredictors:
             return None
         camera_id = self._nearest_camera(frame, {other.camera_id for other in same_size})
         candidates = [other for other in same_size if other.camera_id == camera_id]
-        distances = [pose_distance(self._params, frame.timestep, other.timestep) for other in candidates]
-        return candidates[int(np.argmin(distances))]
+        distances = self._distances(frame.timestep)
+        return min(candidates, key=lambda other: float(distances[other.timestep]))
 
     def _nearest_camera(self, frame: Frame, camera_ids: set[int]) -> int:
         if frame.camera_id in camera_ids:
@@ -79,8 +80,8 @@ class TrivialPredictors:
         if not frames:
             return None
         total = torch.zeros(3, height, width, dtype=torch.int64)
-        for frame in frames:
-            total += read_images([frame])[0]
+        for first in range(0, len(frames), _AT_ONCE):
+            total += read_images(frames[first : first + _AT_ONCE]).sum(dim=0)
         return (total.double() / (255.0 * len(frames))).float()
 
 
@@ -88,11 +89,15 @@ def _read_float(frame: Frame) -> Tensor:
     return read_images([frame], threads=1)[0].float() / 255.0
 
 
-def pose_distance(params: HeadParams, a: int, b: int) -> float:
-    """How far two heads are apart [m]: turn of root and neck together, jaw, translation, expression."""
-    head_a, head_b = (
-        Rotation.from_rotvec(params.rotation[t]) * Rotation.from_rotvec(params.neck_pose[t]) for t in (a, b)
+def pose_distances(params: HeadParams, timestep: int) -> np.ndarray:
+    """How far the head of a timestep is from those of all timesteps [m], shape [T].
+
+    The sum of what root and neck together, jaw, translation and expression move.
+    """
+    head = Rotation.from_rotvec(params.rotation) * Rotation.from_rotvec(params.neck_pose)
+    turn = (head[timestep].inv() * head).magnitude()
+    jaw, moved, expr = (
+        np.linalg.norm(values - values[timestep], axis=1)
+        for values in (params.jaw_pose, params.translation, params.expr)
     )
-    turn = (head_a.inv() * head_b).magnitude() + float(np.linalg.norm(params.jaw_pose[a] - params.jaw_pose[b]))
-    moved = float(np.linalg.norm(params.translation[a] - params.translation[b]))
-    return _ARM * turn + moved + _EXPRESSION * float(np.linalg.norm(params.expr[a] - params.expr[b]))
+    return _ARM * (turn + jaw) + moved + _EXPRESSION * expr

@@ -204,7 +204,7 @@ def test_a_value_of_another_type_is_refused(tmp_path, monkeypatch, capsys):
 def test_toml_round_trip(tmp_path, monkeypatch):
     """``RUN/config.toml`` given back as a preset is the same fit, to the last digit."""
     config = FitConfig(
-        image_scale=1.0 / 3.0,
+        checkpoint_minutes=1.0 / 3.0,
         principal_point="opencv",
         geometry=GeometryConfig(lr_pose=1.2345678901234567e-5, pose_offsets=False, subdivisions=2),
         appearance=AppearanceConfig(offset_net=OffsetNetConfig(enabled=False), epsilon_scale=0.1 + 0.2),
@@ -224,7 +224,7 @@ def test_dict_round_trip():
     assert from_dict({}) == FitConfig()
 
 
-@pytest.mark.parametrize("table", [{"image_scal": 1.0}, {"geometry": {"hiden": 1}}, {"appearance": {"density": {"x": 1}}}])
+@pytest.mark.parametrize("table", [{"log_evry": 1.0}, {"geometry": {"hiden": 1}}, {"appearance": {"density": {"x": 1}}}])
 def test_a_stored_config_with_an_unknown_key_is_refused(table):
     """At any depth."""
     with pytest.raises(ValueError, match="unknown key"):
@@ -261,9 +261,8 @@ def test_a_preset_that_cannot_be_read(preset, text, words, tmp_path, monkeypatch
 @pytest.mark.parametrize(
     ("section", "key", "value", "flag"),
     [
-        (None, "image_scale", 0.0, "--image-scale"),
-        (None, "image_scale", 1.5, "--image-scale"),
-        (None, "image_scale", float("nan"), "--image-scale"),
+        ("geometry", "max_image_size", 15, "--geometry.max-image-size"),
+        ("appearance", "max_image_size", 0, "--appearance.max-image-size"),
         (None, "log_every", 0, "--log-every"),
         ("geometry", "iterations", 0, "--geometry.iterations"),
         ("geometry", "subdivisions", 4, "--geometry.subdivisions"),
@@ -272,6 +271,7 @@ def test_a_preset_that_cannot_be_read(preset, text, words, tmp_path, monkeypatch
         ("geometry", "hidden", 0, "--geometry.hidden"),
         ("geometry", "final_lr", 0.0, "--geometry.final-lr"),
         ("geometry", "initial_scale", 0.0, "--geometry.initial-scale"),
+        ("geometry", "initial_scale", float("nan"), "--geometry.initial-scale"),
         ("appearance", "iterations", 0, "--appearance.iterations"),
         ("appearance", "final_lr", 2.0, "--appearance.final-lr"),
         ("appearance", "initial_opacity", 1.0, "--appearance.initial-opacity"),

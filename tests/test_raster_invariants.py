@@ -88,7 +88,9 @@ def test_equal_depths_keep_the_order_of_the_input(device, form):
     viewmat = torch.eye(4, device=device)
     viewmat[2, 3] = 4.0
     flat = replace(scene, viewmat=viewmat, means=scene.means * torch.tensor([1.0, 1.0, 0.0], device=device))
-    nudged = replace(flat, means=flat.means + torch.arange(400, device=device)[:, None] * torch.tensor([0, 0, 1e-6]).to(device))
+    nudged = replace(
+        flat, means=flat.means + torch.arange(400, device=device)[:, None] * torch.tensor([0, 0, 1e-6]).to(device)
+    )
     assert (render(flat) - render(nudged)).abs().amax((1, 2)).max() < 1e-2
     backwards = replace(flat, **{name: getattr(flat, name).flip(0) for name in NAMES[:5]})
     assert (render(flat) - render(backwards)).abs().max() > 0.1
@@ -193,7 +195,8 @@ def test_more_gaussians_far_aside_change_nothing(device, form):
     """Culled ones leave no trace, and get no gradient."""
     scene = dense(device, form)
     aside = {
-        name: torch.cat([getattr(scene, name), getattr(scene, name)[:50]]) for name in ("quats", "scales", "opacities", "colors")
+        name: torch.cat([getattr(scene, name), getattr(scene, name)[:50]])
+        for name in ("quats", "scales", "opacities", "colors")
     }
     means = torch.cat([scene.means, scene.means[:50] + torch.tensor([500.0, 0, 0], device=device)])
     plain, more = all_of(scene), all_of(replace(scene, means=means, **aside))

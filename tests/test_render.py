@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -185,7 +186,8 @@ def test_png_folder(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     assert done == [(index + 1, N) for index in range(N)]
     assert len(notes) == 1
     pose, camera = poses_of(avatar, driving)[3], avatar.capture.mean_camera()
-    assert np.array_equal(np.asarray(Image.open(out / "00003.png")), to_bytes(avatar.render(pose, camera).image))
+    with Image.open(out / "00003.png") as image:
+        assert np.array_equal(np.asarray(image), to_bytes(avatar.render(pose, camera).image))
 
 
 def test_mp4_round_trip(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
@@ -300,16 +302,22 @@ def test_an_interrupted_rendering_leaves_nothing(avatar: Avatar, driving: Drivin
 def test_no_frames_and_frames_out_of_the_picture_are_said(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no frames are left of its 5"):
         render_driving(avatar, driving, out=tmp_path / "none", frames=slice(9, None))
-    driving.translation[0] += 50.0
-    notes = render_driving(avatar, driving, out=tmp_path / "far")
+    away = driving.translation.copy()
+    away[0] += 50.0
+    notes = render_driving(avatar, replace(driving, translation=away), out=tmp_path / "far")
     assert "outside the picture in 5 of 5 frames" in notes[-1]
 
 
-@pytest.mark.parametrize("name", ["seq_a", "seq_b", "seq_c"])
-def test_real_motion_keeps_the_head_in_the_picture(real_data: Path, name: str) -> None:
-    """Sequences that were tracked elsewhere, on a real capture's camera."""
+@pytest.fixture(scope="module")
+def real_avatar(real_data: Path) -> Avatar:
     subject = read_capture(real_data / "subjects/lps_multiview")
-    avatar = avatar_on(subject, load_head_model(real_data / "head_models/ict_head.npz"))
+    return avatar_on(subject, load_head_model(real_data / "head_models/ict_head.npz"))
+
+
+@pytest.mark.parametrize("name", ["seq_a", "seq_b", "seq_c"])
+def test_real_motion_keeps_the_head_in_the_picture(real_data: Path, real_avatar: Avatar, name: str) -> None:
+    """Sequences that were tracked elsewhere, on a real capture's camera."""
+    avatar = real_avatar
     driving = read_driving(real_data / f"driving/{name}.npz")
     camera = avatar.capture.mean_camera()
     poses = poses_of(avatar, driving)

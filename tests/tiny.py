@@ -61,7 +61,7 @@ def tiny_config(*, geometry: dict[str, Any] | None = None, appearance: dict[str,
     )
 
 
-def write_tiny_capture(root: Path, *, n_timesteps: int = 3) -> Path:
+def write_tiny_capture(root: Path, *, n_timesteps: int = 4) -> Path:
     """A capture whose images show the stretched ball in the poses that its parameters say."""
     write_capture(root, n_timesteps=n_timesteps, size=SIZE, n_shape=4, n_expr=3)
     subject = read_capture(root)

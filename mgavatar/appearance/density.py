@@ -52,7 +52,8 @@ class DensityControl:
         room = max(0, c.max_gaussians - len(g))
         wanted = mean >= c.gradient
         if int(wanted.sum()) > room:
-            wanted &= mean >= mean.sort(descending=True).values[max(room - 1, 0)] if room else torch.zeros_like(wanted)
+            wanted = torch.zeros_like(wanted)
+            wanted[torch.argsort(mean, descending=True, stable=True)[:room]] = True
         sigma = g.log_scales.detach().exp().amax(1) * face_scales[g.face_ids]
         split = wanted & (sigma > c.split_scale * self.extent)
         clone = wanted & ~split

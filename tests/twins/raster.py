@@ -49,7 +49,9 @@ def project(
     """Cull, linearise the camera at each mean, order by depth."""
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     keep = (points[:, 2] > settings.near) & (opacities >= settings.alpha_threshold)
-    keep &= (quats.norm(dim=1) > 1e-12) & (quats.norm(dim=1) < 1e12) & points.isfinite().all(1) & scales.isfinite().all(1)
+    keep &= (
+        (quats.norm(dim=1) > 1e-12) & (quats.norm(dim=1) < 1e12) & points.isfinite().all(1) & scales.isfinite().all(1)
+    )
     index = keep.nonzero()[:, 0]
     order = index[torch.sort(points[index, 2].detach().float(), stable=True).indices]
     x, y, z = points[order].unbind(1)
@@ -72,7 +74,7 @@ def alphas_at(means2d: Tensor, conics: Tensor, opacities: Tensor, pixels: Tensor
 
 def _before(alphas: Tensor) -> Tensor:
     """Light that reaches each Gaussian, shape [M + 1, P]."""
-    return torch.cat([torch.ones_like(alphas[:1]), torch.cumprod(1 - alphas, 0)])
+    return torch.cat([alphas.new_ones(1, alphas.shape[1]), torch.cumprod(1 - alphas, 0)])
 
 
 def _blend(

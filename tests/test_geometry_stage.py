@@ -1,0 +1,345 @@
+"""The geometry stage: personal head, RefineNet, vertex-bound Gaussians and their loss (Eq. 1 to 7)."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from tiny import tiny_config, tiny_head, tiny_subject
+
+from mgavatar.capture.subject import Subject
+from mgavatar.config import FitConfig
+from mgavatar.fit import Views
+from mgavatar.gaussians import SH_C0
+from mgavatar.geometry.head import PersonalHead, PosedHead
+from mgavatar.geometry.refine_net import N_POSE, RefineNet
+from mgavatar.geometry.stage import GeometryStage, VertexGaussians, laplacian_loss, offset_loss
+from mgavatar.head.body import Body
+from mgavatar.kernels.laplacian import laplacian_matrix
+from mgavatar.losses import image_loss
+
+WHITE = torch.ones(3)
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory) -> Subject:
+    """A stretched ball in three poses."""
+    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
+
+
+@pytest.fixture(scope="module")
+def views(subject) -> Views:
+    """Its training images."""
+    return Views.of(subject, 64)
+
+
+def make_stage(subject: Subject, config: FitConfig) -> GeometryStage:
+    """A stage at its start."""
+    torch.manual_seed(0)
+    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    return GeometryStage(VertexGaussians(head, config), config)
+
+
+def run(stage: GeometryStage, views: Views, iterations: int) -> dict[str, float]:
+    """Views in turn; the terms of the last step."""
+    for iteration in range(iterations):
+        index = iteration % len(views.images)
+        target = views.images[index].float() / 255.0
+        terms = stage.step(views.cameras[index], views.timesteps[index], target, WHITE)
+    return terms
+
+
+def random_posed(n: int, *, seed: int = 0) -> PosedHead:
+    """Offsets as a fit might have them."""
+    rng = torch.Generator().manual_seed(seed)
+    return PosedHead(*(0.1 * torch.randn(n, 3, generator=rng) for _ in range(4)))
+
+
+def small_mesh() -> tuple[SimpleNamespace, list[list[int]]]:
+    """Two triangles over four vertices as the loss sees them, and the neighbours of each vertex."""
+    matrix = laplacian_matrix(torch.tensor([[0, 1, 2], [0, 2, 3]]), 4)
+    gaussians = SimpleNamespace(head=SimpleNamespace(body=SimpleNamespace(laplacian=matrix)))
+    return gaussians, [[1, 2, 3], [0, 2], [0, 1, 3], [0, 2]]
+
+
+def test_the_stage_starts_at_the_template(subject):
+    """Before the first step no vertex is off the parametric head, in any pose."""
+    head = make_stage(subject, tiny_config()).gaussians.head
+    for timestep in range(len(subject.params)):
+        pose = head.pose(timestep)
+        posed = head.posed(pose)
+        assert not posed.identity_offsets.any()
+        assert not posed.pose_offsets.any()
+        shaped = head.body.shaped(torch.tensor(subject.params.shape))
+        assert torch.equal(posed.shaped, shaped)
+        assert torch.equal(posed.verts, head.body.posed(shaped, pose, joints=head.body.joints(shaped)))
+    assert torch.equal(head.canonical(), shaped)
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_where_identity_starts(subject, tracked):
+    """At the capture's shape, or at the neutral template by option."""
+    head = make_stage(subject, tiny_config(geometry={"start_from_tracked_shape": tracked})).gaussians.head
+    expected = subject.params.shape if tracked else np.zeros_like(subject.params.shape)
+    assert np.array_equal(head.betas.detach().numpy(), expected)
+
+
+def test_poses_start_as_tracked(subject):
+    """Every parameter of every timestep."""
+    head = make_stage(subject, tiny_config()).gaussians.head
+    tracked = {"neck": "neck_pose", "jaw": "jaw_pose", "eyes": "eyes_pose"}
+    for name, value in head.poses.items():
+        assert np.array_equal(value.detach().numpy(), getattr(subject.params, tracked.get(name, name)))
+
+
+def test_the_triplane_is_read_bilinearly():
+    """Features are those of torch's own sampler on three planes over the bounding box (Eq. 1)."""
+    torch.manual_seed(1)
+    verts = torch.rand(40, 3) * torch.tensor([0.2, 0.3, 0.1])
+    net = RefineNet(verts, tiny_config().geometry)
+    features = net.encode()
+    low, high = verts.min(0).values, verts.max(0).values
+    place = (verts - low) / (high - low).max()
+    expected = []
+    for plane, (a, b) in zip(net.planes, ((0, 1), (1, 2), (2, 0)), strict=True):
+        maps = plane.reshape(1, 16, 16, 4).permute(0, 3, 1, 2)
+        grid = torch.stack([2 * place[:, a] - 1, 1 - 2 * place[:, b]], 1)[None, None]
+        sampled = torch.nn.functional.grid_sample(maps, grid, align_corners=False, padding_mode="border")
+        expected.append(sampled[0, :, 0].T)
+    assert torch.allclose(features, torch.cat(expected, 1), atol=1e-6)
+
+
+def test_pose_offsets_are_the_network_of_features_and_pose():
+    """Eq. 2: splitting the first layer into a vertex's and the pose's share changes nothing."""
+    torch.manual_seed(2)
+    config = tiny_config().geometry
+    net = RefineNet(torch.rand(30, 3), config)
+    torch.nn.init.normal_(net.phi_pose[-1].weight)
+    features, pose = net.encode(), torch.randn(N_POSE)
+    plain = net.phi_pose(torch.cat([features, pose.expand(30, N_POSE)], 1))
+    assert plain.abs().max() > 0.1
+    assert torch.allclose(net.pose_offsets(features, pose), config.offset_unit * plain, atol=1e-7)
+
+
+def test_offsets_add_up_before_posing(subject):
+    """Eq. 3: the posed head is the parametric one plus both offsets, on joints that only identity moves."""
+    head = make_stage(subject, tiny_config()).gaussians.head
+    torch.nn.init.normal_(head.refine.phi_id[-1].weight)
+    torch.nn.init.normal_(head.refine.phi_pose[-1].weight)
+    pose = head.pose(1)
+    posed = head.posed(pose)
+    assert posed.identity_offsets.abs().max() > 1e-4
+    assert posed.pose_offsets.abs().max() > 1e-4
+    canonical = posed.shaped + posed.identity_offsets
+    assert torch.allclose(head.canonical(), canonical, atol=1e-8)
+    verts = head.body.posed(canonical + posed.pose_offsets, pose, joints=head.body.joints(canonical))
+    assert torch.allclose(posed.verts, verts, atol=1e-8)
+    neck = replace(pose, neck=pose.neck + 0.3)
+    assert torch.equal(head.posed(neck).identity_offsets, posed.identity_offsets)
+    assert not torch.allclose(head.posed(neck).pose_offsets, posed.pose_offsets)
+    root = replace(pose, rotation=pose.rotation + 0.3, translation=pose.translation + 1.0)
+    assert torch.equal(head.posed(root).pose_offsets, posed.pose_offsets)
+
+
+def test_without_pose_offsets_there_is_no_network(subject, views):
+    """The ablation has no Phi_pose, and still learns."""
+    stage = make_stage(subject, tiny_config(geometry={"pose_offsets": False}))
+    assert stage.gaussians.head.refine.phi_pose is None
+    assert not any("phi_pose" in name for name, _ in stage.gaussians.named_parameters())
+    terms = run(stage, views, 3)
+    assert np.isfinite(terms["loss"])
+    assert not stage.gaussians.head.posed(stage.gaussians.head.pose(0)).pose_offsets.any()
+
+
+def test_vertex_gaussians_have_reduced_freedom(subject, views):
+    """Opacity 1, no rotation, one scale, colour of the constant harmonic; also after learning."""
+    stage = make_stage(subject, tiny_config())
+    run(stage, views, 4)
+    gaussians = stage.gaussians
+    bound = gaussians.bound(gaussians.head.posed(gaussians.head.pose(0)))
+    assert torch.equal(bound.opacities, torch.ones(gaussians.head.body.n_verts))
+    assert torch.equal(bound.quats, torch.tensor([1.0, 0, 0, 0]).expand(len(bound.means), 4))
+    assert torch.equal(bound.scales, gaussians.log_scales.exp()[:, None].expand(-1, 3))
+    assert torch.equal(bound.colors, 0.5 + SH_C0 * gaussians.colors)
+    assert SH_C0 == pytest.approx(0.5 / np.sqrt(np.pi))
+
+
+def test_gaussians_start_at_half_the_edges(subject):
+    """The scale at the start goes by the mesh, and the colour is grey."""
+    config = tiny_config(geometry={"initial_scale": 0.5})
+    gaussians = make_stage(subject, config).gaussians
+    edges = gaussians.head.body.edge_lengths(gaussians.head.body.shaped(gaussians.head.betas))
+    assert torch.allclose(gaussians.log_scales.exp(), 0.5 * edges, rtol=1e-5)
+    assert not gaussians.colors.any()
+
+
+def test_gaussians_are_drawn_behind_the_surface(subject):
+    """A shift of 0 draws at the vertices, as in the paper; a shift of 1 one sigma behind them."""
+    at, behind = (
+        make_stage(subject, tiny_config(geometry={"surface_shift": shift})).gaussians for shift in (0.0, 1.0)
+    )
+    posed = at.head.posed(at.head.pose(0))
+    assert torch.equal(at.bound(posed).means, posed.verts)
+    moved = behind.bound(posed).means - posed.verts
+    assert torch.allclose(moved.norm(dim=1), behind.log_scales.exp(), rtol=1e-4)
+    inwards = posed.verts.mean(0) - posed.verts
+    assert (moved * inwards).sum(1).min() > 0
+
+
+def test_the_shift_passes_no_gradient(subject):
+    """Drawn behind or not, the gradient of a vertex is that of its Gaussian, and scales get none from the shift."""
+    gaussians = make_stage(subject, tiny_config()).gaussians
+    posed = gaussians.head.posed(gaussians.head.pose(0))
+    weights = torch.randn_like(posed.verts)
+    verts = posed.verts.detach().requires_grad_()
+    (gaussians.bound(replace(posed, verts=verts)).means * weights).sum().backward()
+    assert torch.equal(verts.grad, weights)
+    assert gaussians.log_scales.grad is None
+
+
+def test_offset_loss_by_hand():
+    """Eq. 5 with the norms as squared lengths averaged over vertices."""
+    posed = random_posed(4)
+    scales = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    identity, by_pose = posed.identity_offsets.numpy(), posed.pose_offsets.numpy()
+    expected = ((identity**2).sum() + (by_pose**2).sum() + (scales.numpy() ** 2).sum()) / 4
+    assert offset_loss(posed, scales).item() == pytest.approx(expected, rel=1e-6)
+    assert offset_loss(replace(posed, pose_offsets=torch.zeros(4, 3)), 0 * scales).item() == pytest.approx(
+        (identity**2).sum() / 4, rel=1e-6
+    )
+
+
+def test_laplacian_loss_by_hand():
+    """Eq. 6 as it reads: Laplacians of mu_c, mu and mu_bar, vertex minus mean of its neighbours."""
+    gaussians, neighbours = small_mesh()
+    posed, scales = random_posed(4, seed=1), torch.tensor([0.3, 0.1, 0.5, 0.2])
+
+    def lap(x: np.ndarray) -> np.ndarray:
+        return np.stack([x[i] - x[near].mean(0) for i, near in enumerate(neighbours)])
+
+    bar = posed.shaped.double().numpy()
+    canonical = bar + posed.identity_offsets.double().numpy()
+    animated = canonical + posed.pose_offsets.double().numpy()
+    expected = (
+        ((lap(canonical) - lap(bar)) ** 2).sum()
+        + ((lap(animated) - lap(bar)) ** 2).sum()
+        + (lap(scales.double().numpy()) ** 2).sum()
+    ) / 4
+    assert laplacian_loss(gaussians, posed, scales).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_laplacian_loss_does_not_see_a_translation():
+    """Offsets that are the same everywhere, and equal scales, cost nothing."""
+    gaussians, _ = small_mesh()
+    moved = replace(
+        random_posed(4),
+        identity_offsets=torch.tensor([0.1, -0.2, 0.3]).expand(4, 3),
+        pose_offsets=torch.tensor([-0.5, 0.0, 0.25]).expand(4, 3),
+    )
+    assert laplacian_loss(gaussians, moved, torch.full((4,), 0.7)).item() < 1e-13
+    assert laplacian_loss(gaussians, random_posed(4), torch.full((4,), 0.7)).item() > 1e-4
+
+
+def test_the_loss_is_the_weighted_sum(subject, views):
+    """Eq. 7: every term with its weight from the config, at the values before the step."""
+    config = tiny_config(geometry={"lambda_offset": 3.0, "lambda_laplacian": 50.0})
+    stage = make_stage(subject, config)
+    run(stage, views, 3)
+    gaussians = stage.gaussians
+    target = views.images[0].float() / 255.0
+    with torch.no_grad():
+        posed = gaussians.head.posed(gaussians.head.pose(views.timesteps[0]))
+        scales = gaussians.log_scales.exp()
+        image = gaussians.render(posed, views.cameras[0], WHITE).image
+        expected = {
+            "image": image_loss(image, target, config.loss).item(),
+            "offset": 3.0 * offset_loss(posed, scales).item(),
+            "laplacian": 50.0 * laplacian_loss(gaussians, posed, scales).item(),
+        }
+    terms = stage.step(views.cameras[0], views.timesteps[0], target, WHITE)
+    for name, value in expected.items():
+        assert value > 0
+        assert terms[name] == pytest.approx(value, rel=1e-5)
+    assert terms["loss"] == pytest.approx(sum(expected.values()), rel=1e-5)
+    assert terms["gaussians"] == gaussians.head.body.n_verts
+
+
+def test_the_loss_falls_and_the_mesh_grows_towards_the_truth(subject, views):
+    """Thirty steps bring the images nearer, and the ball takes on some of the stretch that it lacked."""
+    geometry = {"iterations": 30, "lambda_laplacian": 100.0, "lr_refine": 3e-2, "hidden": 32}
+    stage = make_stage(subject, tiny_config(geometry=geometry))
+    gaussians = stage.gaussians
+
+    def score() -> float:
+        with torch.no_grad():
+            losses = [
+                image_loss(
+                    gaussians.render(gaussians.head.posed(gaussians.head.pose(timestep)), camera, WHITE).image,
+                    image.float() / 255.0,
+                    stage.config.loss,
+                )
+                for image, camera, timestep in zip(views.images, views.cameras, views.timesteps, strict=True)
+            ]
+        return float(torch.stack(losses).mean())
+
+    def width() -> float:
+        canonical = gaussians.head.canonical().detach()
+        return float(canonical[:, 0].max() - canonical[:, 0].min())
+
+    before, width_before = score(), width()
+    run(stage, views, 30)
+    assert score() < 0.85 * before
+    assert width() > 1.02 * width_before
+
+
+def test_gradients_reach_everything_that_is_learned(subject, views):
+    """Identity, expression, pose, translation, planes, both networks, scales and colours."""
+    stage = make_stage(subject, tiny_config())
+    run(stage, views, 2)
+    for name, parameter in stage.gaussians.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any(), name
+    in_optimizer = {id(p) for group in stage.optimizer.param_groups for p in group["params"]}
+    assert in_optimizer == {id(p) for p in stage.gaussians.parameters()}
+
+
+def test_a_timestep_that_is_not_trained_stays_as_tracked(subject, views):
+    """Held-out timesteps keep the tracker's parameters, to the bit."""
+    trained = set(views.timesteps)
+    held_out = [t for t in range(len(subject.params)) if t not in trained]
+    assert held_out
+    stage = make_stage(subject, tiny_config())
+    before = {name: value.detach().clone() for name, value in stage.gaussians.head.poses.items()}
+    run(stage, views, 6)
+    for name, value in stage.gaussians.head.poses.items():
+        assert torch.equal(value[held_out], before[name][held_out]), name
+        assert not torch.equal(value[sorted(trained)], before[name][sorted(trained)]), name
+
+
+def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
+    """Each group its own rate, and all of them the stated share of it at the end."""
+    config = tiny_config(geometry={"iterations": 10, "final_lr": 0.25})
+    stage = make_stage(subject, config)
+    g = config.geometry
+    start = [g.lr_refine, g.lr_shape, g.lr_expr, g.lr_pose, g.lr_translation, g.lr_scale, g.lr_color]
+    assert [group["lr"] for group in stage.optimizer.param_groups] == start
+    run(stage, views, 10)
+    assert [group["lr"] for group in stage.optimizer.param_groups] == pytest.approx([0.25 * lr for lr in start])
+
+
+def test_a_stage_goes_on_from_its_state(subject, views):
+    """Saved after three steps and loaded elsewhere, the fourth step is the same to the bit."""
+    stage = make_stage(subject, tiny_config())
+    run(stage, views, 3)
+    state = copy.deepcopy(stage.state_dict())
+    other = make_stage(subject, tiny_config())
+    other.load_state_dict(state)
+    terms = [run(each, views, 1) for each in (stage, other)]
+    assert terms[0] == terms[1]
+    for a, b in zip(stage.gaussians.parameters(), other.gaussians.parameters(), strict=True):
+        assert torch.equal(a, b)
