@@ -95,7 +95,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             return
         T = real(1.0)
         red, green, blue, depth = real(0.0), real(0.0), real(0.0), real(0.0)
-        accepted = int(-1)
+        accepted = wp.int32(-1)
         for k in range(tile_begin[tile], tile_end[tile]):
             if T >= stop:
                 n = item_splat[items[k]]
@@ -143,7 +143,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         y = (tile // n_columns) * TILE + lane // TILE
         T = real(1.0)
         v_red, v_green, v_blue, v_depth, behind = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
-        accepted = int(-1)
+        accepted = wp.int32(-1)
         if x < v_image.shape[2] and y < v_image.shape[1]:
             T = final_T[y, x]
             v_red = v_image[0, y, x]

@@ -51,7 +51,7 @@ _COMMON = """
     const int x1 = x0 + TW < width ? x0 + TW : width, y1 = y0 + TH < height ? y0 + TH : height;
     const int begin = tile_begin.data[tile], end = tile_end.data[tile];
     const float threshold = alpha_threshold;
-""" % {"tile_width": TILE_WIDTH, "tile_height": TILE_HEIGHT}  # noqa: UP031
+""" % {"tile_width": TILE_WIDTH, "tile_height": TILE_HEIGHT}
 
 # The rows of one splat inside the tile, and for each the interval of pixels where alpha can reach the threshold:
 # curvature u^2 + inv_var_y dy^2 <= reach, for LANES rows at a time. The slack only admits pixels that the test on alpha
@@ -71,7 +71,8 @@ _ROWS = """
             const vf rooms = reach - heights;
             const vf half_xs = fma(__builtin_elementwise_sqrt(most(rooms, (vf)0.0f)), (vf)radius, (vf)0.01f);
             const vf centers = fma((vf)shear, dys, (vf)ox);
-            const vf lefts = least(most(__builtin_elementwise_ceil((px + centers) - half_xs), (vf)(float)x0), (vf)(float)x1);
+            vf lefts = __builtin_elementwise_ceil((px + centers) - half_xs);
+            lefts = least(most(lefts, (vf)(float)x0), (vf)(float)x1);
             const vf rights = least((px + centers) + half_xs, (vf)(float)(x1 - 1));
             const vi firsts = __builtin_convertvector(lefts, vi);
             const vi ends = __builtin_convertvector(__builtin_elementwise_floor(most(rights, lefts - 1.0f)), vi) + 1;
@@ -236,7 +237,8 @@ def _composite_tile(
     tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
     items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array[wp.float32], n_columns: int,
     width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
-    image: wp.array3d[wp.float32], coverage: wp.array2d[wp.float32], depths: wp.array2d[wp.float32], final_T: wp.array2d[wp.float32], last: wp.array2d[wp.int32],
+    image: wp.array3d[wp.float32], coverage: wp.array2d[wp.float32], depths: wp.array2d[wp.float32],
+    final_T: wp.array2d[wp.float32], last: wp.array2d[wp.int32],
 ): ...  # fmt: skip
 
 
@@ -300,5 +302,6 @@ def composite_rows_bwd_kernel(
 ):
     _composite_tile_bwd(
         first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        v_image.shape[2], v_image.shape[1], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths, partials,
+        v_image.shape[2], v_image.shape[1], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
+        partials,
     )  # fmt: skip

@@ -23,8 +23,8 @@ SPLAT = (
 )  # fmt: skip
 """Columns of a splat, one cache line in single precision.
 
-The mean is the centre of (pixel_x, pixel_y), which are whole numbers, plus the offset [px]. The ellipse where alpha is at
-the threshold is ``curvature u^2 + inv_var_y (y - my)^2 = reach``; ``half_y`` is its half height, ``radius`` is
+The mean is the centre of (pixel_x, pixel_y), which are whole numbers, plus the offset [px]. The ellipse where alpha is
+at the threshold is ``curvature u^2 + inv_var_y (y - my)^2 = reach``; ``half_y`` is its half height, ``radius`` is
 ``1 / sqrt(curvature)``. Reach and half height are a little larger, so that rounding never cuts a pixel off.
 """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -182,8 +182,10 @@ def build_appearance(head: PersonalHead, config: FitConfig, *, seed: int) -> App
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        payload = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, IndexError, EOFError, ValueError, KeyError, OSError) as error:
+        with warnings.catch_warnings():  # torch remarks on pickles that it then refuses
+            warnings.simplefilter("ignore", UserWarning)
+            payload = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # whatever another kind of file makes the unpickler raise
         raise DataError(f"{path}: not an MGAvatar avatar; give the avatar.pt that `mgavatar fit` wrote") from error
     if not isinstance(payload, dict) or not str(payload.get("format", "")).startswith("mgavatar/"):
         raise DataError(f"{path}: not an MGAvatar avatar; give the avatar.pt that `mgavatar fit` wrote")
@@ -247,14 +249,22 @@ def _capture_of(state: dict[str, Any]) -> CaptureInfo:
         name: None if value is None else value.numpy() for name, value in state["tracked"].items()
     }
     viewmats, Ks = state["viewmats"].numpy(), state["Ks"].numpy()
-    if not (np.isfinite(viewmats).all() and np.isfinite(Ks).all()):
-        raise ValueError("a camera is not finite")
+    arrays = {"viewmats": viewmats, "Ks": Ks, **{name: value for name, value in tracked.items() if value is not None}}
+    for name, values in arrays.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} of the capture is not finite")
+    if viewmats.shape[1:] != (4, 4) or Ks.shape[1:] != (3, 3) or min(map(min, state["sizes"])) < 1:
+        raise ValueError("a camera has another shape than a camera has")
     cameras = {
         int(index): Camera(viewmat, K, int(width), int(height))
         for index, viewmat, K, (width, height) in zip(state["camera_ids"], viewmats, Ks, state["sizes"], strict=True)
     }
     background = np.array(state["background"], np.float32)
     ids, train = tuple(state["timestep_ids"]), tuple(state["train_timesteps"])
+    if background.shape != (3,) or not np.isfinite(background).all():
+        raise ValueError("the background is not a colour")
+    if len(ids) != len(tracked["expr"]) or not all(0 <= timestep < len(ids) for timestep in train):
+        raise ValueError("timesteps do not fit the tracked parameters")
     return CaptureInfo(HeadParams(**tracked), ids, train, cameras, background)
 
 

@@ -61,10 +61,10 @@ class GeometryConfig:
     """Learn Phi_pose (Eq. 2)."""
     offset_unit: float = 0.01
     """What an output of 1 of Phi_id and Phi_pose means [m]."""
-    surface_shift: float = 1.0
+    surface_shift: float = 0.0
     """Gaussians are drawn this many of their own sigma behind the surface: opaque Gaussians look larger than the
-    surface that carries them. Not in the paper, which is 0."""
-    initial_scale: float = 0.5
+    surface that carries them, and photometry alone pulls the mesh inwards. The paper has none."""
+    initial_scale: float = 0.35
     """Sigma of a Gaussian at the start, in mean lengths of the edges at its vertex."""
     start_from_tracked_shape: bool = True
     """Start beta at the capture's ``shape``; otherwise at the neutral template."""

@@ -147,7 +147,7 @@ def fit(
         Interrupted: After Ctrl-C; the avatar as far as it came has been saved.
     """
     torch.manual_seed(seed)
-    checkpoint = _read_checkpoint(run, config) if resume else None
+    checkpoint = _read_checkpoint(run, config, seed) if resume else None
     run.folder.mkdir(parents=True, exist_ok=True)
     if checkpoint is None:
         (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
@@ -160,7 +160,7 @@ def fit(
     try:
         geometry = GeometryStage(vertex_gaussians, config)
         if checkpoint is not None:
-            geometry.load_state_dict(checkpoint["geometry"])
+            _restore(geometry, checkpoint, run)
         loop.run_stage(
             geometry,
             Views.of(subject, config.geometry.max_image_size),
@@ -173,7 +173,7 @@ def fit(
         appearance = build_appearance(head, config, seed=seed)
         stage = AppearanceStage(appearance, config, seed=seed)
         if checkpoint is not None and "appearance" in checkpoint:
-            stage.load_state_dict(checkpoint["appearance"])
+            _restore(stage, checkpoint, run)
         avatar = Avatar(vertex_gaussians, appearance, capture, config)
         loop.run_stage(
             stage,
@@ -257,18 +257,28 @@ class _Loop:
             self._save(stage, stage.iterations, state)
 
     def _save(self, stage: Stage, iteration: int, state: Callable[[], dict[str, Any]]) -> None:
-        checkpoint = {"stage": stage.name, "iteration": iteration, "config": to_toml(self.config), **state()}
+        checkpoint = {"stage": stage.name, "iteration": iteration, "config": to_toml(self.config), "seed": self.seed}
+        checkpoint |= state()
         with atomic_write(self.run.checkpoint) as file:
             torch.save(checkpoint, file)
 
 
-def _read_checkpoint(run: Run, config: FitConfig) -> dict[str, Any]:
+def _restore(stage: Stage, checkpoint: dict[str, Any], run: Run) -> None:
+    try:
+        stage.load_state_dict(checkpoint[stage.name])
+    except (RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{run.checkpoint}: was made with another capture or head model; give those again") from error
+
+
+def _read_checkpoint(run: Run, config: FitConfig, seed: int) -> dict[str, Any]:
     path = existing_file(run.checkpoint)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        stored = checkpoint["config"]
+        stored, stored_seed = checkpoint["config"], checkpoint["seed"]
     except Exception as error:
         raise DataError(f"{path}: not a checkpoint of `mgavatar fit`; remove the folder and start again") from error
     if stored != to_toml(config):
         raise DataError(f"{path}: was made with another configuration; give --preset {run.folder / 'config.toml'}")
+    if stored_seed != seed:
+        raise DataError(f"{path}: was made with --seed {stored_seed}, not {seed}; give --seed {stored_seed}")
     return checkpoint

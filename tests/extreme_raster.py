@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -108,8 +109,6 @@ def _at(depth: float) -> Callable[..., None]:
 
 
 def _with(**changes: Any) -> Scene:
-    from dataclasses import replace
-
     return replace(_scene(), **changes)
 
 
@@ -232,6 +231,5 @@ def cases() -> list[Case]:
         _too_many((131072, 65536)),
     ]
     for column, name in enumerate(("mean", "quaternion", "scale", "opacity", "colour")):
-        for value in (math.nan, math.inf, -math.inf):
-            rows.append(_culled(f"{name} {value}", _set(column, value)))
+        rows += [_culled(f"{name} {value}", _set(column, value)) for value in (math.nan, math.inf, -math.inf)]
     return rows

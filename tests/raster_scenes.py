@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -29,7 +29,7 @@ class Scene:
     background: Tensor
     K: Tensor
     size: tuple[int, int]
-    settings: RasterSettings = RasterSettings()
+    settings: RasterSettings = field(default_factory=RasterSettings)
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:

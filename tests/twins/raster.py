@@ -29,7 +29,7 @@ class Footprints:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Matrices of quaternions wxyz of any length: the exponential's closed form, I + 2w [v] + 2 [v]^2, shape [N, 3, 3]."""
+    """Matrices of quaternions wxyz of any length, I + 2w [v] + 2 [v]^2 with [v] the cross product, shape [N, 3, 3]."""
     w, x, y, z = (quats / quats.norm(dim=1, keepdim=True)).unbind(1)
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
@@ -110,7 +110,7 @@ def rasterize(
     settings: RasterSettings,
     shift: Tensor | None = None,
 ) -> Tensor:
-    """Red, green, blue, coverage and depth, shape [5, H, W]; ``shift`` [px], shape [N, 2], moves the means in the image."""
+    """Red, green, blue, coverage and depth, shape [5, H, W]; ``shift`` [N, 2] moves the means in the image [px]."""
     seen = project(means, quats, scales, opacities, viewmat, K, size, settings)
     if shift is not None:
         seen = replace(seen, means2d=seen.means2d + shift[seen.order])

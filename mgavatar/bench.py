@@ -1,0 +1,245 @@
+"""``mgavatar bench kernels``: how fast the kernels are on this machine, next to plain forms and the machine's limits.
+
+Machines differ and drift, so everything is timed in one run and what counts are the ratios: to the plain form, and to
+the floor, the time that the machine would need for the arithmetic or the bytes alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+
+from mgavatar.bench_work import Job, Machine, Step, head_scene, jobs
+from mgavatar.kernels import bridge
+from mgavatar.kernels.rasterize import RasterSettings
+
+REPEATS, PLAIN_REPEATS = 9, 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of the table; times are medians [ms]."""
+
+    name: str
+    work: str
+    threads: int
+    forward_ms: float
+    backward_ms: float
+    spread: float
+    """Half the distance between the quartiles of forward + backward, over its median."""
+    floor_ms: float
+    plain_ms: float | None
+    """Plain form, forward + backward."""
+
+    @property
+    def total_ms(self) -> float:
+        """Forward + backward."""
+        return self.forward_ms + self.backward_ms
+
+
+@contextmanager
+def _threads(n: int) -> Iterator[None]:
+    before = bridge.num_threads(), torch.get_num_threads()
+    bridge.set_num_threads(n)
+    torch.set_num_threads(n)
+    try:
+        yield
+    finally:
+        bridge.set_num_threads(before[0])
+        torch.set_num_threads(before[1])
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _time(step: Step, repeats: int, device: torch.device) -> list[tuple[float, float]]:
+    """Seconds of the forward and the backward pass, after one run that compiles and warms up."""
+    step()()
+    times = []
+    for _ in range(repeats):
+        start = _now(device)
+        backward = step()
+        middle = _now(device)
+        backward()
+        times.append((middle - start, _now(device) - middle))
+    return times
+
+
+def _median_of(function: Callable[[], object], repeats: int, device: torch.device) -> float:
+    function()
+    times = []
+    for _ in range(repeats):
+        start = _now(device)
+        function()
+        times.append(_now(device) - start)
+    return median(times)
+
+
+def calibrate(device: torch.device) -> Machine:
+    """Measure the machine: a matrix product that stays in the caches, and a sum over more than they hold."""
+    n = 768 if device.type == "cpu" else 8192
+    a = torch.rand(n, n, device=device)
+    out = torch.empty_like(a)
+    many = torch.ones(64 * 2**20 if device.type == "cpu" else 2**30, device=device)
+    return Machine(
+        operations=n**3 / _median_of(lambda: torch.mm(a, a, out=out), 15, device),
+        bytes=4.0 * many.numel() / _median_of(many.sum, 7, device),
+    )
+
+
+def _row(job: Job, machine: Machine, threads: int, device: torch.device) -> Row:
+    times = _time(job.step, REPEATS, device)
+    plain = _time(job.plain, PLAIN_REPEATS, device) if job.plain is not None else None
+    totals = sorted(f + b for f, b in times)
+    middle = median(totals)
+    quarter = len(totals) // 4
+    return Row(
+        name=job.name,
+        work=job.work,
+        threads=threads,
+        forward_ms=1e3 * median(f for f, _ in times),
+        backward_ms=1e3 * median(b for _, b in times),
+        spread=(totals[-1 - quarter] - totals[quarter]) / (2 * middle),
+        floor_ms=1e3 * job.floor(machine),
+        plain_ms=None if plain is None else 1e3 * median(f + b for f, b in plain),
+    )
+
+
+def _exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
+    """Slope of log time over log size, least squares."""
+    x = [math.log(s) for s in sizes]
+    y = [math.log(s) for s in seconds]
+    mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
+    rise = sum((a - mean_x) * (b - mean_y) for a, b in zip(x, y, strict=True))
+    return rise / sum((a - mean_x) ** 2 for a in x)
+
+
+def _exponents(device: torch.device) -> dict[str, float]:
+    """How the rasterizer's time grows with Gaussians, pixels and views."""
+
+    def seconds(n: int, side: int, views: int = 1) -> float:
+        scene = head_scene(n, (side, side), device)
+
+        def run() -> None:
+            for _ in range(views):
+                scene.loss(RasterSettings()).backward()
+
+        return _median_of(run, 5, device)
+
+    counts, sides, views = (10_000, 20_000, 40_000, 80_000), (128, 256, 512, 1024), (1, 2, 4)
+    return {
+        "Gaussians": _exponent(counts, [seconds(n, 512) for n in counts]),
+        "pixels": _exponent([side**2 for side in sides], [seconds(20_000, side) for side in sides]),
+        "views": _exponent(views, [seconds(20_000, 256, n) for n in views]),
+    }
+
+
+def _device_name(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores"
+
+
+def _commit() -> str | None:
+    """The commit that runs, where the program runs from a checkout with git."""
+    folder = Path(__file__).resolve().parent.parent
+    if not (folder / ".git").exists():
+        return None
+    try:
+        command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def _table(rows: Sequence[Row]) -> str:
+    head = ("kernel", "work", "threads", "forward", "backward", "spread", "x floor", "plain / it")
+    lines = [head]
+    for row in rows:
+        plain = "-" if row.plain_ms is None else f"{row.plain_ms / row.total_ms:.1f}"
+        lines.append(
+            (
+                row.name,
+                row.work,
+                str(row.threads),
+                f"{row.forward_ms:.2f} ms",
+                f"{row.backward_ms:.2f} ms",
+                f"{100 * row.spread:.0f} %",
+                f"{row.total_ms / row.floor_ms:.1f}",
+                plain,
+            )
+        )
+    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )
+
+
+def _blending_shares(rows: Sequence[Row]) -> list[str]:
+    whole = {row.work: row.total_ms for row in rows if row.name == "rasterize"}
+    parts = {row.work: row.total_ms for row in rows if row.name == "blending alone"}
+    return [
+        f"blending is {100 * parts[work] / whole[work]:.0f} % of rasterize at {work}" for work in whole if work in parts
+    ]
+
+
+def bench_kernels(*, threads: int | None = None, json_path: Path | None = None, device: str = "cpu") -> str:
+    """Time every kernel, its plain form and the machine itself.
+
+    Args:
+        threads: CPU threads for kernels and torch; all of the machine's by default.
+        json_path: Where to write the rows as JSON.
+        device: ``cpu`` or ``cuda``.
+
+    Returns:
+        A table for people.
+
+    Raises:
+        ValueError: If ``threads`` is not positive.
+    """
+    where = torch.device(device)
+    n = bridge.num_threads() if threads is None else threads
+    rows: list[Row] = []
+    with _threads(n):
+        machine = calibrate(where)
+        rows.extend(_row(job, machine, n, where) for job in jobs(where))
+        exponents = _exponents(where)
+    name = _device_name(where)
+    if json_path is not None:
+        report: dict[str, Any] = {
+            "device": name,
+            "commit": _commit(),
+            "operations_per_s": machine.operations,
+            "bytes_per_s": machine.bytes,
+            "exponents": exponents,
+            "rows": [asdict(row) for row in rows],
+        }
+        json_path.write_text(json.dumps(report, indent=2) + "\n")
+    growth = ", ".join(f"{what} {exponent:.2f}" for what, exponent in exponents.items())
+    speed = f"{machine.operations / 1e9:.0f} G multiply-adds/s, {machine.bytes / 1e9:.1f} GB/s"
+    return "\n".join(
+        [f"{name}; {speed}", "", _table(rows), "", *_blending_shares(rows), f"exponents of rasterize's time: {growth}"]
+    )

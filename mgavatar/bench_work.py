@@ -1,0 +1,355 @@
+"""What ``mgavatar bench kernels`` times: each kernel on a stated amount of work, its plain form, and its floor.
+
+A plain form computes the same values the obvious way: one thread a pixel in 16 x 16 tiles for the rasterizer, torch or
+kornia for the rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import kornia
+import torch
+from torch import Tensor
+
+from mgavatar.kernels import binding, laplacian, lbs, uv_map
+from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
+from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
+from mgavatar.kernels.ssim import compare_images
+
+Step = Callable[[], Callable[[], object]]
+"""Runs a forward pass and returns what runs its backward pass."""
+
+RASTER_OPERATIONS = (26, 62)
+"""Multiply-adds for each pixel inside an ellipse, forward and backward, as counted from the formulas."""
+
+SSIM_OPERATIONS = (5 * 22 + 20, 3 * 22 + 20)
+"""For each value of the image: a separable window of 11 over five maps forward and three backward."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Machine:
+    """Speed of the machine, measured in the same run: multiply-adds and bytes read a second."""
+
+    operations: float
+    bytes: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """One row of the table.
+
+    Attributes:
+        name: Kernel.
+        work: What it works on.
+        step: The kernel.
+        plain: Its plain form, or None where there is none.
+        operations: Multiply-adds that cannot be avoided, both directions together.
+        bytes: Bytes that cannot be avoided, both directions together.
+    """
+
+    name: str
+    work: str
+    step: Step
+    plain: Step | None
+    operations: float = 0.0
+    bytes: float = 0.0
+
+    def floor(self, machine: Machine) -> float:
+        """Least time that the work can take on ``machine`` [s]."""
+        return max(self.operations / machine.operations, self.bytes / machine.bytes)
+
+
+def _autograd(loss: Callable[[], Tensor]) -> Step:
+    def step() -> Callable[[], object]:
+        return loss().backward
+
+    return step
+
+
+def _random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+@dataclass(frozen=True)
+class HeadScene:
+    """Gaussians on an ellipsoid before a camera, as tensors of ``rasterize``."""
+
+    gaussians: tuple[Tensor, ...]
+    viewmat: Tensor
+    K: Tensor
+    size: tuple[int, int]
+
+    def loss(self, settings: RasterSettings) -> Tensor:
+        """Sum of the squared image."""
+        out = rasterize(*self.gaussians, viewmat=self.viewmat, K=self.K, size=self.size, settings=settings)
+        return out.image.square().sum()
+
+
+def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> HeadScene:
+    """The benchmark's scene: ``n`` Gaussians whose sizes cover the ellipsoid whatever ``n`` is, seen from 3.6 m."""
+    g = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
+    scales = math.sqrt(4 * math.pi * 0.75 / n) * (0.6 + 0.4 * torch.rand(n, 3, generator=g))
+    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=g), dim=1)
+    opacities = torch.sigmoid(1 + 1.5 * torch.randn(n, generator=g))
+    colors = torch.rand(n, 3, generator=g)
+    if opaque:
+        opacities = torch.ones(n)
+    viewmat = torch.eye(4)
+    viewmat[2, 3] = 3.6
+    focal = 1.4 * size[1]
+    K = torch.tensor([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
+    gaussians = (directions * torch.tensor([0.75, 1.0, 0.85]), quats, scales, opacities, colors)
+    leaves = tuple(tensor.to(device).requires_grad_() for tensor in gaussians)
+    return HeadScene(leaves, viewmat.to(device), K.to(device), size)
+
+
+def _ellipse_pixels(scene: HeadScene) -> float:
+    """Pixels inside all ellipses where alpha reaches the threshold, hidden or not."""
+    background = scene.viewmat.new_zeros(3)
+    detached = tuple(tensor.detach() for tensor in scene.gaussians)
+    splats = project(RasterSettings(), scene.size, (*detached, scene.viewmat, scene.K, background)).splats.double()
+    seen = splats[splats[:, 6] > 0]
+    return float((math.pi * seen[:, 12] / (seen[:, 4] * seen[:, 6]).sqrt()).sum())
+
+
+def raster_job(name: str, n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> Job:
+    """Projection to image and back."""
+    scene = head_scene(n, size, device, opaque=opaque)
+    return Job(
+        name=name,
+        work=f"{n // 1000}K, {size[0]} x {size[1]}",
+        step=_autograd(lambda: scene.loss(RasterSettings())),
+        plain=_autograd(lambda: scene.loss(RasterSettings(form="plain"))),
+        operations=sum(RASTER_OPERATIONS) * _ellipse_pixels(scene),
+    )
+
+
+def blending_job(n: int, size: tuple[int, int], device: torch.device) -> Job:
+    """The blending alone, of the same scene: its share of the time is what the rest leaves."""
+    scene = head_scene(n, size, device)
+    background = scene.viewmat.new_zeros(3)
+    settings = RasterSettings()
+    tensors = (*(tensor.detach() for tensor in scene.gaussians), scene.viewmat, scene.K, background)
+
+    def step_of(settings: RasterSettings) -> Step:
+        work = project(settings, size, tensors)
+
+        def step() -> Callable[[], object]:
+            image, coverage, depth, final_T, last = blend(settings, work, background)
+            return lambda: blend_backward(settings, work, background, final_T, last, [2 * image, coverage, depth])
+
+        return step
+
+    return Job(
+        name="blending alone",
+        work=f"{n // 1000}K, {size[0]} x {size[1]}",
+        step=step_of(settings),
+        plain=step_of(replace(settings, form="plain")),
+        operations=sum(RASTER_OPERATIONS) * _ellipse_pixels(scene),
+    )
+
+
+def lbs_job(device: torch.device, n_verts: int = 20_000, n_dirs: int = 400) -> Job:
+    """Blend shapes and skinning; the floor reads every direction once in each direction."""
+    template = _random(n_verts, 3).to(device).requires_grad_()
+    dirs = _random(n_dirs, n_verts, 3, seed=1).to(device)
+    coeffs = _random(n_dirs, seed=2).to(device).requires_grad_()
+    weights = torch.softmax(_random(n_verts, 5, seed=3), 1).to(device)
+    transforms = torch.eye(4).repeat(5, 1, 1).to(device).requires_grad_()
+
+    def plain() -> Tensor:
+        verts = template + torch.einsum("k,kvc->vc", coeffs, dirs)
+        blended = torch.einsum("vj,jrc->vrc", weights, transforms[:, :3])
+        return ((blended[:, :, :3] @ verts[:, :, None])[:, :, 0] + blended[:, :, 3]).square().sum()
+
+    return Job(
+        name="skinning",
+        work=f"{n_verts // 1000}K vertices, {n_dirs} directions",
+        step=_autograd(lambda: lbs.skin(lbs.blend_shapes(template, dirs, coeffs), weights, transforms).square().sum()),
+        plain=_autograd(plain),
+        bytes=2 * 4.0 * dirs.numel(),
+    )
+
+
+def _torch_hash(points: Tensor, table: Tensor, levels: list[list[int]]) -> Tensor:
+    features = []
+    corners = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
+    primes = torch.tensor([1, 2654435761, 805459861], device=points.device)
+    for resolution, first, n_entries in levels:
+        x = points * resolution
+        cell = x.floor().clamp(max=resolution - 1)
+        part = (x - cell)[:, None]
+        vertices = cell.long()[:, None] + corners
+        side = resolution + 1
+        if side**3 <= n_entries:
+            entries = vertices[..., 0] + side * (vertices[..., 1] + side * vertices[..., 2])
+        else:
+            hashed = vertices * primes % 2**32
+            entries = (hashed[..., 0] ^ hashed[..., 1] ^ hashed[..., 2]) % n_entries
+        weights = torch.where(corners.bool(), part, 1 - part).prod(2, keepdim=True)
+        features.append((weights * table[first + entries]).sum(1))
+    return torch.cat(features, 1)
+
+
+def hash_grid_job(device: torch.device, n: int = 40_000) -> Job:
+    """Features of points and an optimizer step; plain: torch's indexing with its Adam over the whole table."""
+    grid = HashGrid(HashGridShape()).to(device)
+    points = torch.rand(n, 3, generator=torch.Generator().manual_seed(0)).to(device)
+    table = grid.table.detach().clone().requires_grad_()
+    levels = grid.shape.table_levels().tolist()
+    adam = torch.optim.Adam([table], lr=1e-2, betas=(0.9, 0.99), eps=1e-15)
+
+    def step() -> Callable[[], object]:
+        loss = grid(points).square().sum()
+
+        def backward() -> None:
+            loss.backward()
+            grid.adam_step(1e-2)
+
+        return backward
+
+    def plain() -> Callable[[], object]:
+        loss = _torch_hash(points, table, levels).square().sum()
+
+        def backward() -> None:
+            adam.zero_grad()
+            loss.backward()
+            adam.step()
+
+        return backward
+
+    touched = 8.0 * n * grid.n_outputs
+    return Job(
+        name="hash grid with Adam",
+        work=f"{n // 1000}K points, 16 levels x 2",
+        step=step,
+        plain=plain,
+        bytes=3 * 4.0 * touched,
+    )
+
+
+def ssim_job(device: torch.device, side: int = 512) -> Job:
+    """SSIM and mean absolute error of an RGB image."""
+    image = torch.rand(3, side, side, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
+    target = torch.rand(3, side, side, generator=torch.Generator().manual_seed(1)).to(device)
+
+    def plain() -> Tensor:
+        return kornia.losses.ssim_loss(image[None], target[None], 11) + (image - target).abs().mean()
+
+    return Job(
+        name="SSIM + L1",
+        work=f"{side} x {side} RGB",
+        step=_autograd(lambda: compare_images(image, target).sum()),
+        plain=_autograd(plain),
+        operations=float(sum(SSIM_OPERATIONS) * image.numel()),
+    )
+
+
+def _sheet(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """A curved sheet of (rows + 1)(columns + 1) vertices: positions, faces, UV."""
+    v, u = torch.meshgrid(torch.linspace(0, 1, rows + 1), torch.linspace(0, 1, columns + 1), indexing="ij")
+    uv = torch.stack([u, v], 2).reshape(-1, 2)
+    verts = torch.cat([uv, 0.1 * torch.sin(7 * uv.sum(1, keepdim=True))], 1)
+    index = torch.arange(len(uv)).reshape(rows + 1, columns + 1)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    faces = torch.stack([a, b, c, a, c, d], 2).reshape(-1, 3).int()
+    return verts, faces, uv
+
+
+def mesh_jobs(device: torch.device) -> Iterator[Job]:
+    """Laplacian, binding and UV map on a sheet of 20K vertices and 40K faces."""
+    points, faces, uv = (tensor.to(device) for tensor in _sheet(100, 200))
+    verts = points.requires_grad_()
+    n_verts = len(verts)
+    matrix = laplacian.laplacian_matrix(faces, n_verts)
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).long()
+    edges = torch.unique(torch.cat([edges, edges.flip(1)]), dim=0)
+    degree = torch.bincount(edges[:, 0], minlength=n_verts)[:, None]
+
+    def plain_laplacian() -> Tensor:
+        sums = torch.zeros_like(verts).index_add(0, edges[:, 0], verts[edges[:, 1]])
+        return (verts - sums / degree).square().sum()
+
+    yield Job(
+        name="Laplacian",
+        work=f"{n_verts // 1000}K vertices",
+        step=_autograd(lambda: laplacian.laplacian(matrix, verts).square().sum()),
+        plain=_autograd(plain_laplacian),
+        bytes=2 * (8.0 * len(edges) + 24.0 * n_verts),
+    )
+    yield _binding_job(verts, faces)
+    yield _uv_job(verts, faces, uv)
+
+
+def _binding_job(verts: Tensor, faces: Tensor) -> Job:
+    n = len(faces)
+    index = faces.long()
+    order = binding.gather_matrix(faces, len(verts))
+    local = [_random(n, k, seed=k).to(verts.device).requires_grad_() for k in (3, 4)]
+    scales = torch.rand(n, 3, generator=torch.Generator().manual_seed(0)).to(verts.device).requires_grad_()
+
+    def step() -> Tensor:
+        face_quats, face_scales, centers = binding.face_frames(verts, faces, order=order)
+        means, quats, sizes = binding.to_world(face_quats, face_scales, centers, local[0], local[1], scales)
+        return means.square().sum() + quats.square().sum() + sizes.square().sum()
+
+    def plain() -> Tensor:
+        a, b, c = verts[index].unbind(1)
+        edge = torch.nn.functional.normalize(b - a, dim=1)
+        normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=1)
+        third = torch.linalg.cross(edge, normal)
+        k = ((b - a).norm(dim=1) + ((c - a) * third).sum(1).abs())[:, None] / 2
+        R = torch.stack([edge, normal, third], 2)
+        means = k * (R @ local[0][:, :, None])[:, :, 0] + (a + b + c) / 3
+        q = kornia.geometry.conversions.rotation_matrix_to_quaternion(R)
+        w, x, y, z = q.unbind(1)
+        left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w], 1).reshape(-1, 4, 4)
+        quats = (left @ local[1][:, :, None])[:, :, 0]
+        return means.square().sum() + quats.square().sum() + (k * scales).square().sum()
+
+    return Job(
+        name="binding",
+        work=f"{n // 1000}K Gaussians",
+        step=_autograd(step),
+        plain=_autograd(plain),
+        bytes=2 * 4.0 * n * (9 + 10 + 10),
+    )
+
+
+def _uv_job(verts: Tensor, faces: Tensor, uv: Tensor, side: int = 256) -> Job:
+    drawn = uv_map.uv_map(uv, faces, faces, len(verts), side, side)
+    covered = drawn.face_ids.reshape(-1).long()
+    corners = faces.long()[covered.clamp(min=0)]
+    rows, columns = torch.meshgrid(torch.arange(side), torch.arange(side), indexing="ij")
+    places = torch.stack([(columns + 0.5) / side, 1 - (rows + 0.5) / side], 2).reshape(-1, 2).to(uv)
+    a, b, c = uv[corners].unbind(1)
+    bary = torch.linalg.solve(torch.stack([b - a, c - a], 2), (places - a)[:, :, None])[:, :, 0]
+    weights = torch.cat([1 - bary.sum(1, keepdim=True), bary], 1) * (covered >= 0)[:, None]
+
+    def plain() -> Tensor:
+        return (weights[:, :, None] * verts[corners]).sum(1).T.reshape(3, side, side).square().sum()
+
+    return Job(
+        name="UV position map",
+        work=f"{side} x {side}",
+        step=_autograd(lambda: uv_map.position_map(drawn, verts).square().sum()),
+        plain=_autograd(plain),
+        bytes=2 * 4.0 * side * side * (3 + 6),
+    )
+
+
+def jobs(device: torch.device) -> Iterator[Job]:
+    """All rows of the table, made one at a time."""
+    yield raster_job("rasterize", 20_000, (512, 512), device)
+    yield blending_job(20_000, (512, 512), device)
+    yield raster_job("rasterize", 100_000, (802, 550), device)
+    yield blending_job(100_000, (802, 550), device)
+    yield raster_job("rasterize, opaque", 20_000, (512, 512), device, opaque=True)
+    yield lbs_job(device)
+    yield hash_grid_job(device)
+    yield ssim_job(device)
+    yield from mesh_jobs(device)

@@ -1,0 +1,328 @@
+"""The fit as a whole: repeatable, interruptible, resumable, and what it leaves in its folder."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from checks import threads
+from tiny import tiny_config, tiny_head, tiny_subject
+
+from mgavatar.appearance.stage import AppearanceStage
+from mgavatar.avatar import Avatar
+from mgavatar.capture.subject import Subject
+from mgavatar.config import FitConfig, from_dict
+from mgavatar.errors import DataError
+from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run
+from mgavatar.geometry.stage import GeometryStage
+
+STAGES = {"geometry": GeometryStage, "appearance": AppearanceStage}
+
+
+@pytest.fixture(scope="module")
+def subject(tmp_path_factory) -> Subject:
+    """A stretched ball in three poses, and a fourth that is held out."""
+    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
+
+
+def fit_into(
+    out: Path, subject: Subject, *, seed: int = 0, resume: bool = False, config: FitConfig | None = None
+) -> Run:
+    """Fit the tiny subject; density control works at steps 4 and 8."""
+    run = open_run(out, resume=resume)
+    device = torch.device("cpu")
+    fit(subject, tiny_head(), config or tiny_config(), run, device=device, seed=seed, resume=resume)
+    return run
+
+
+@pytest.fixture(scope="module")
+def whole(subject, tmp_path_factory) -> Run:
+    """A fit that nobody interrupted."""
+    return fit_into(tmp_path_factory.mktemp("whole") / "run", subject)
+
+
+def contents(run: Run) -> dict[str, Any]:
+    """Everything in the avatar file by its path."""
+
+    def flat(value: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+        items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else None
+        if items is None:
+            yield prefix, value
+            return
+        for key, inner in items:
+            yield from flat(inner, f"{prefix}/{key}")
+
+    return dict(flat(torch.load(run.avatar, weights_only=True), ""))
+
+
+def differing(a: Run, b: Run) -> list[str]:
+    """Names of what is not the same, to the bit, in two avatars."""
+    one, other = contents(a), contents(b)
+    assert one.keys() == other.keys()
+    return [
+        name
+        for name, value in one.items()
+        if not (torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name])
+    ]
+
+
+@contextmanager
+def at_step(monkeypatch: pytest.MonkeyPatch, stage: str, step: int, act: Callable[[], None]) -> Iterator[None]:
+    """Do something during a step of a stage."""
+    kind = STAGES[stage]
+    count = itertools.count(1)
+    original = kind.step
+
+    def stepped(self: Any, *args: Any) -> Any:
+        if next(count) == step:
+            act()
+        return original(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kind, "step", stepped)
+        yield
+
+
+def press_ctrl_c() -> None:
+    """What the terminal does."""
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def log_lines(run: Run) -> list[dict[str, Any]]:
+    """``metrics.jsonl``, parsed."""
+    return [json.loads(line) for line in run.metrics.read_text().splitlines()]
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+def test_a_seed_repeats_a_fit_to_the_bit(n_threads, whole, subject, tmp_path):
+    """Again, with one thread or two: the same avatar."""
+    with threads(n_threads):
+        again = fit_into(tmp_path / "run", subject)
+    assert differing(whole, again) == []
+
+
+def test_another_seed_is_another_fit(whole, subject, tmp_path):
+    """Views come in another order, networks start elsewhere."""
+    names = differing(whole, fit_into(tmp_path / "run", subject, seed=1))
+    assert "/geometry/head.refine.planes" in names
+    assert "/appearance/color_net.grid.table" in names
+
+
+def test_a_fit_leaves_a_usable_avatar(whole, subject):
+    """It draws the subject better than nothing at all, and holds what density control added."""
+    avatar = Avatar.load(whole.avatar)
+    assert avatar.appearance is not None
+    assert avatar.n_gaussians > len(avatar.head.body.faces)
+    frame = subject.frames["train"][0]
+    target = Views.of(subject, 64).images[0].float() / 255.0
+    image = avatar.render(avatar.head.pose(frame.timestep), frame.camera).image
+    assert (image - target).square().mean() < 0.5 * (1.0 - target).square().mean()
+
+
+def test_what_is_in_the_folder(whole):
+    """Configuration, log, checkpoint and avatar; nothing half-written."""
+    names = sorted(path.name for path in whole.folder.iterdir())
+    assert names == ["avatar.pt", "checkpoint.pt", "config.toml", "metrics.jsonl"]
+    assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text())) == tiny_config()
+
+
+def test_the_log(whole):
+    """Every fourth step of both stages, each with all of its terms, and they add up."""
+    lines = log_lines(whole)
+    assert [(line["stage"], line["iteration"]) for line in lines] == [
+        (stage, iteration) for stage in ("geometry", "appearance") for iteration in (4, 8, 12)
+    ]
+    for line in lines:
+        parts = ("image", "offset", "laplacian") if line["stage"] == "geometry" else ("image", "offset", "binding")
+        assert line["loss"] == pytest.approx(sum(line[part] for part in parts), rel=1e-5)
+        assert line["gaussians"] >= 162
+        assert line["seconds"] >= 0
+
+
+def test_the_last_step_is_logged_whatever_the_interval(subject, tmp_path):
+    """Also where it is no multiple."""
+    run = fit_into(tmp_path / "run", subject, config=replace(tiny_config(), log_every=7))
+    assert [line["iteration"] for line in log_lines(run)] == [7, 12, 7, 12]
+
+
+@pytest.mark.parametrize(
+    ("stage", "step"),
+    [("geometry", 1), ("geometry", 5), ("geometry", 12), ("appearance", 2), ("appearance", 6), ("appearance", 12)],
+)
+def test_ctrl_c_leaves_an_avatar_and_resume_ends_as_if_nothing_had_been(
+    stage, step, whole, subject, tmp_path, monkeypatch
+):
+    """In either stage, before, after and at the end of density control: the same bits as in one go."""
+    before = signal.getsignal(signal.SIGINT)
+    with at_step(monkeypatch, stage, step, press_ctrl_c), pytest.raises(Interrupted, match=f"{stage} at {step}/12"):
+        fit_into(tmp_path / "run", subject)
+    assert signal.getsignal(signal.SIGINT) is before
+    avatar = Avatar.load(tmp_path / "run" / "avatar.pt")
+    assert (avatar.appearance is None) is (stage == "geometry")
+    assert avatar.render(avatar.head.pose(0), avatar.capture.mean_camera()).alpha.max() > 0.5
+    resumed = fit_into(tmp_path / "run", subject, resume=True)
+    assert differing(whole, resumed) == []
+    drop = ("seconds",)
+    logs = [[{k: v for k, v in line.items() if k not in drop} for line in log_lines(run)] for run in (whole, resumed)]
+    assert logs[0] == logs[1]
+
+
+def test_two_interruptions(whole, subject, tmp_path, monkeypatch):
+    """In both stages, one after the other."""
+    with at_step(monkeypatch, "geometry", 7, press_ctrl_c), pytest.raises(Interrupted):
+        fit_into(tmp_path / "run", subject)
+    with at_step(monkeypatch, "appearance", 5, press_ctrl_c), pytest.raises(Interrupted):
+        fit_into(tmp_path / "run", subject, resume=True)
+    assert differing(whole, fit_into(tmp_path / "run", subject, resume=True)) == []
+
+
+def test_a_finished_fit_can_be_resumed(whole, subject, tmp_path):
+    """Nothing is left to do, and the avatar is the same."""
+    run = fit_into(tmp_path / "run", subject)
+    run.avatar.unlink()
+    assert differing(whole, fit_into(tmp_path / "run", subject, resume=True)) == []
+
+
+def test_the_second_ctrl_c_stops_at_once(subject, tmp_path, monkeypatch):
+    """Whoever presses twice does not wait for the step to end; the handler is put back."""
+    before = signal.getsignal(signal.SIGINT)
+
+    def twice() -> None:
+        press_ctrl_c()
+        press_ctrl_c()
+
+    with at_step(monkeypatch, "geometry", 3, twice), pytest.raises(KeyboardInterrupt):
+        fit_into(tmp_path / "run", subject)
+    assert signal.getsignal(signal.SIGINT) is before
+    assert not (tmp_path / "run" / "avatar.pt").exists()
+
+
+@pytest.mark.parametrize(("stage", "step"), [("geometry", 6), ("appearance", 7)])
+def test_a_crash_costs_what_came_after_the_last_checkpoint(stage, step, whole, subject, tmp_path, monkeypatch):
+    """Checkpoints are written as the fit goes; a fit that was killed goes on from there to the same bits."""
+    often = replace(tiny_config(), checkpoint_minutes=0.0)
+
+    def crash() -> None:
+        raise RuntimeError("power cut")
+
+    with at_step(monkeypatch, stage, step, crash), pytest.raises(RuntimeError, match="power cut"):
+        fit_into(tmp_path / "run", subject, config=often)
+    checkpoint = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert (checkpoint["stage"], checkpoint["iteration"]) == (stage, step - 1)
+    resumed = fit_into(tmp_path / "run", subject, config=often, resume=True)
+    assert differing(whole, resumed) == ["/config/checkpoint_minutes"]
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit(subject, tmp_path):
+    """With the stage, the step and what to do."""
+    config = tiny_config(geometry={"lr_scale": 1e30})
+    with pytest.raises(DataError, match="geometry loss is not finite at iteration .*; lower the learning rates"):
+        fit_into(tmp_path / "run", subject, config=config)
+    assert not (tmp_path / "run" / "avatar.pt").exists()
+
+
+def test_an_avatar_by_its_own_path(subject, tmp_path):
+    """``--out x.pt`` puts the avatar there, and the rest into the folder beside it."""
+    run = fit_into(tmp_path / "x.pt", subject)
+    assert run.avatar == tmp_path / "x.pt"
+    assert run.folder == tmp_path / "x"
+    assert Avatar.load(tmp_path / "x.pt").n_gaussians > 0
+
+
+def test_where_a_fit_may_write(tmp_path):
+    """A new folder or an empty one; never over what is there."""
+    assert open_run(tmp_path / "new", resume=False).avatar == tmp_path / "new" / "avatar.pt"
+    (tmp_path / "empty").mkdir()
+    assert open_run(tmp_path / "empty", resume=False).folder == tmp_path / "empty"
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "resume", "words"),
+    [
+        ("full", False, "full: is not empty; .*--resume"),
+        ("file", False, "file: is a file; .*another folder"),
+        ("full.pt", False, "full: is not empty"),
+        ("taken.pt", False, r"taken\.pt: exists; .*another name"),
+        ("full", True, r"checkpoint\.pt: nothing to resume; leave --resume out"),
+        ("absent", True, r"checkpoint\.pt: nothing to resume"),
+    ],
+)
+def test_where_a_fit_may_not_write(out, resume, words, tmp_path):
+    """One line with the path and the remedy, and nothing is touched."""
+    (tmp_path / "full").mkdir()
+    for name in ("full/something", "file", "taken.pt"):
+        (tmp_path / name).write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(DataError, match=words):
+        open_run(tmp_path / out, resume=resume)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_resuming_with_another_configuration_is_refused(whole, subject):
+    """The remedy is the configuration that the run itself wrote down."""
+    config = tiny_config(geometry={"lr_color": 0.5})
+    with pytest.raises(DataError, match=r"checkpoint\.pt: was made with another configuration; .*config\.toml"):
+        fit_into(whole.folder, subject, resume=True, config=config)
+
+
+def test_resuming_with_another_seed_is_refused(whole, subject):
+    """It would see the views in another order, and be no continuation."""
+    with pytest.raises(DataError, match=r"checkpoint\.pt: was made with --seed 0, not 5; give --seed 0"):
+        fit_into(whole.folder, subject, seed=5, resume=True)
+
+
+def test_resuming_with_another_capture_is_refused(whole, subject):
+    """One that has other timesteps cannot be what the checkpoint was made of."""
+    params = replace(subject.params, **{
+        name: np.repeat(getattr(subject.params, name), 2, 0)
+        for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+    })  # fmt: skip
+    before = whole.avatar.read_bytes()
+    with pytest.raises(DataError, match=r"checkpoint\.pt: .*another capture"):
+        fit_into(whole.folder, replace(subject, params=params), resume=True)
+    assert whole.avatar.read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"PK\x03\x04"])
+def test_a_broken_checkpoint_is_refused(content, subject, tmp_path):
+    """In one line, which names it."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
+    with pytest.raises(DataError, match=r"checkpoint\.pt: not a checkpoint"):
+        fit_into(tmp_path / "run", subject, resume=True)
+
+
+def test_every_view_comes_once_in_a_pass():
+    """Shuffled passes, another order in each, the same for the same seed."""
+    views = list(itertools.islice(ViewOrder(7, 3), 21))
+    passes = [views[i : i + 7] for i in (0, 7, 14)]
+    assert all(sorted(each) == list(range(7)) for each in passes)
+    assert passes[0] != passes[1]
+    assert views == list(itertools.islice(ViewOrder(7, 3), 21))
+    assert views != list(itertools.islice(ViewOrder(7, 4), 21))
+
+
+@pytest.mark.parametrize(("max_size", "side"), [(40, 40), (1000, 40), (20, 20), (17, 17)])
+def test_images_and_cameras_are_reduced_together(subject, max_size, side):
+    """Never enlarged; what the camera sees stays where it was."""
+    views = Views.of(subject, max_size)
+    assert views.images.shape == (6, 3, side, side)
+    assert views.images.dtype == torch.uint8
+    point = np.array([0.03, -0.02, 0.04, 1.0])
+    for frame, camera in zip(subject.frames["train"], views.cameras, strict=True):
+        assert (camera.width, camera.height) == (side, side)
+        full, small = (c.K @ (c.viewmat @ point)[:3] for c in (frame.camera, camera))
+        assert np.allclose(full[:2] / full[2] / 40, small[:2] / small[2] / side)
+    assert views.timesteps == [frame.timestep for frame in subject.frames["train"]]
