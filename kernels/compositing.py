@@ -19,6 +19,7 @@ import warp as wp
 
 TILE = 16
 BLOCK = TILE * TILE
+"""Threads of a tile: also what Warp puts into a CUDA block by default, which the block sums below rely on."""
 
 _BLOCK_SUM = """
 #if defined(__CUDA_ARCH__)

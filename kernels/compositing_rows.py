@@ -80,10 +80,11 @@ _ROWS = """
                 const float dy = dys[j], center = centers[j], row = -0.72134752f * heights[j];
                 const int base = (strip + j - y0) * STRIDE - x0, stop_x = ends[j];
                 for (int x = firsts[j]; x < stop_x; x += LANES) {
+                    const int i = base + x;
+                    if (!__builtin_reduce_or(OPEN)) continue;  // nothing is seen here any more
                     const vf u = (lane + ((float)x - px)) - center;
                     const vf G = exp2(fma(steepness * u, u, (vf)row));
                     const vf alpha = least(opacity * G, (vf)cap);
-                    const int i = base + x;
 """
 
 _FORWARD = (
@@ -109,7 +110,7 @@ _FORWARD = (
         }
         const float* s = &splats.data[16LL * item_splat.data[items.data[k]]];
 """
-    + _ROWS
+    + _ROWS.replace("OPEN", "*(const vf*)&T[i] >= stop")
     + """
                     const vf t = *(const vf*)&T[i];
                     const vi use = (alpha >= threshold) & (t >= stop);
@@ -186,7 +187,7 @@ _BACKWARD = (
         vf h0 = 0.0f, hu = 0.0f, hy = 0.0f, huu = 0.0f, huy = 0.0f, hyy = 0.0f;
         vf c0 = 0.0f, c1 = 0.0f, c2 = 0.0f, c3 = 0.0f;
 """
-    + _ROWS
+    + _ROWS.replace("OPEN", "*(const vi*)&accepted[i] >= k")
     + """
                     const vi use = (alpha >= threshold) & (*(const vi*)&accepted[i] >= k);
                     const vf a = use ? alpha : (vf)0.0f;

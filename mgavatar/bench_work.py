@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import kornia
 import torch
@@ -45,7 +45,7 @@ class Job:
         name: Kernel.
         work: What it works on.
         step: The kernel.
-        plain: Its plain form, or None where there is none.
+        plain: Its plain form.
         operations: Multiply-adds that cannot be avoided, both directions together.
         bytes: Bytes that cannot be avoided, both directions together.
     """
@@ -53,7 +53,7 @@ class Job:
     name: str
     work: str
     step: Step
-    plain: Step | None
+    plain: Step
     operations: float = 0.0
     bytes: float = 0.0
 
@@ -128,29 +128,18 @@ def raster_job(name: str, n: int, size: tuple[int, int], device: torch.device, *
     )
 
 
-def blending_job(n: int, size: tuple[int, int], device: torch.device) -> Job:
-    """The blending alone, of the same scene: its share of the time is what the rest leaves."""
+def blending_step(n: int, size: tuple[int, int], device: torch.device) -> Step:
+    """The blending alone, of the same scene: its share of the time is what projection, sort and lists leave."""
     scene = head_scene(n, size, device)
     background = scene.viewmat.new_zeros(3)
     settings = RasterSettings()
-    tensors = (*(tensor.detach() for tensor in scene.gaussians), scene.viewmat, scene.K, background)
+    work = project(settings, size, (*(t.detach() for t in scene.gaussians), scene.viewmat, scene.K, background))
 
-    def step_of(settings: RasterSettings) -> Step:
-        work = project(settings, size, tensors)
+    def step() -> Callable[[], object]:
+        image, coverage, depth, final_T, last = blend(settings, work, background)
+        return lambda: blend_backward(settings, work, background, final_T, last, [image, coverage, depth])
 
-        def step() -> Callable[[], object]:
-            image, coverage, depth, final_T, last = blend(settings, work, background)
-            return lambda: blend_backward(settings, work, background, final_T, last, [2 * image, coverage, depth])
-
-        return step
-
-    return Job(
-        name="blending alone",
-        work=f"{n // 1000}K, {size[0]} x {size[1]}",
-        step=step_of(settings),
-        plain=step_of(replace(settings, form="plain")),
-        operations=sum(RASTER_OPERATIONS) * _ellipse_pixels(scene),
-    )
+    return step
 
 
 def lbs_job(device: torch.device, n_verts: int = 20_000, n_dirs: int = 400) -> Job:
@@ -195,9 +184,9 @@ def _torch_hash(points: Tensor, table: Tensor, levels: list[list[int]]) -> Tenso
     return torch.cat(features, 1)
 
 
-def hash_grid_job(device: torch.device, n: int = 40_000) -> Job:
+def hash_grid_job(device: torch.device, n: int = 40_000, *, log2_table_size: int = 19) -> Job:
     """Features of points and an optimizer step; plain: torch's indexing with its Adam over the whole table."""
-    grid = HashGrid(HashGridShape()).to(device)
+    grid = HashGrid(HashGridShape(log2_table_size=log2_table_size)).to(device)
     points = torch.rand(n, 3, generator=torch.Generator().manual_seed(0)).to(device)
     table = grid.table.detach().clone().requires_grad_()
     levels = grid.shape.table_levels().tolist()
@@ -345,9 +334,7 @@ def _uv_job(verts: Tensor, faces: Tensor, uv: Tensor, side: int = 256) -> Job:
 def jobs(device: torch.device) -> Iterator[Job]:
     """All rows of the table, made one at a time."""
     yield raster_job("rasterize", 20_000, (512, 512), device)
-    yield blending_job(20_000, (512, 512), device)
     yield raster_job("rasterize", 100_000, (802, 550), device)
-    yield blending_job(100_000, (802, 550), device)
     yield raster_job("rasterize, opaque", 20_000, (512, 512), device, opaque=True)
     yield lbs_job(device)
     yield hash_grid_job(device)

@@ -66,6 +66,9 @@ class GeometryConfig:
     surface that carries them, and photometry alone pulls the mesh inwards. The paper has none."""
     initial_scale: float = 0.35
     """Sigma of a Gaussian at the start, in mean lengths of the edges at its vertex."""
+    scales_follow_mesh: bool = False
+    """Scales grow and shrink with the edges at their vertex, on top of what they learn: where the mesh is stretched to
+    twice its size, as at shoulders that the template lacks, its Gaussians still cover it. Not in the paper."""
     start_from_tracked_shape: bool = True
     """Start beta at the capture's ``shape``; otherwise at the neutral template."""
 
@@ -160,6 +163,9 @@ class FitConfig:
     principal_point: Literal["center", "opencv", "opengl"] = "center"
     """Where the capture's principal point is: the centre (as GaussianAvatars assumes), or cx, cy counted from the
     top (opencv) or from the bottom (opengl)."""
+    random_background: bool = False
+    """Put training images on a new colour at every iteration, where the capture has masks: a white shirt on a white
+    background is no edge otherwise. Not in the paper."""
     log_every: int = 20
     """Iterations between lines of ``metrics.jsonl``."""
     checkpoint_minutes: float = 5.0

@@ -17,7 +17,7 @@ from torch import Tensor
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar, CaptureInfo, build_appearance
 from mgavatar.camera import Camera
-from mgavatar.capture.images import read_images
+from mgavatar.capture.images import read_images, read_masks
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, to_toml
 from mgavatar.errors import DataError
@@ -48,23 +48,35 @@ class Views:
 
     Attributes:
         images: Shape [N, 3, H, W], uint8, on the CPU.
+        masks: Coverage, shape [N, H, W], uint8, or None where a view has none.
         cameras: N cameras at the size of ``images``.
         timesteps: N rows of the capture's parameters.
     """
 
     images: Tensor
+    masks: Tensor | None
     cameras: list[Camera]
     timesteps: list[int]
 
     @staticmethod
-    def of(subject: Subject, max_size: int) -> Views:
+    def of(subject: Subject, max_size: int, *, with_masks: bool) -> Views:
         """Decode the training split, reduced until its longer side has at most ``max_size`` pixels."""
         frames = subject.frames["train"]
         first = frames[0].camera
         scale = min(1.0, max_size / max(first.width, first.height))
         size = (max(1, round(first.width * scale)), max(1, round(first.height * scale)))
         cameras = [frame.camera.scaled(*size) for frame in frames]
-        return Views(read_images(frames, size=size), cameras, [frame.timestep for frame in frames])
+        masked = with_masks and all(frame.mask_path is not None for frame in frames)
+        masks = read_masks(frames, size=size) if masked else None
+        return Views(read_images(frames, size=size), masks, cameras, [frame.timestep for frame in frames])
+
+    def target(self, view: int, background: Tensor, new_background: Tensor) -> Tensor:
+        """A view in 0..1, shape [3, H, W], moved from one background colour to another."""
+        image = self.images[view].to(background.device).float() / 255.0
+        if self.masks is None:
+            return image
+        clear = 1.0 - self.masks[view].to(background.device).float() / 255.0
+        return image + clear * (new_background - background)[:, None, None]
 
 
 class ViewOrder:
@@ -163,7 +175,7 @@ def fit(
             _restore(geometry, checkpoint, run)
         loop.run_stage(
             geometry,
-            Views.of(subject, config.geometry.max_image_size),
+            Views.of(subject, config.geometry.max_image_size, with_masks=config.random_background),
             Avatar(vertex_gaussians, None, capture, config),
             done=_done(checkpoint, geometry),
             state=lambda: {"geometry": geometry.state_dict()},
@@ -177,7 +189,7 @@ def fit(
         avatar = Avatar(vertex_gaussians, appearance, capture, config)
         loop.run_stage(
             stage,
-            Views.of(subject, config.appearance.max_image_size),
+            Views.of(subject, config.appearance.max_image_size, with_masks=config.random_background),
             avatar,
             done=_done(checkpoint, stage),
             state=lambda: {"geometry": finished, "appearance": stage.state_dict()},
@@ -236,8 +248,9 @@ class _Loop:
         with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
             for iteration in range(done + 1, stage.iterations + 1):
                 view = next(order)
-                target = views.images[view].to(self.background.device).float() / 255.0
-                terms = stage.step(views.cameras[view], views.timesteps[view], target, self.background)
+                background = self._background(iteration) if views.masks is not None else self.background
+                target = views.target(view, self.background, background)
+                terms = stage.step(views.cameras[view], views.timesteps[view], target, background)
                 if not np.isfinite(terms["loss"]):
                     raise DataError(
                         f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "
@@ -255,6 +268,11 @@ class _Loop:
                     raise Interrupted(f"stopped in {stage.name} at {iteration}/{stage.iterations}")
         if stage.iterations > done:
             self._save(stage, stage.iterations, state)
+
+    def _background(self, iteration: int) -> Tensor:
+        """The colour of an iteration; it depends on nothing else, so a resumed run sees the same."""
+        color = np.random.default_rng((self.seed, iteration)).random(3, dtype=np.float32)
+        return torch.from_numpy(color).to(self.background.device)
 
     def _save(self, stage: Stage, iteration: int, state: Callable[[], dict[str, Any]]) -> None:
         checkpoint = {"stage": stage.name, "iteration": iteration, "config": to_toml(self.config), "seed": self.seed}

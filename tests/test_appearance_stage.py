@@ -41,7 +41,7 @@ def subject(tmp_path_factory) -> Subject:
 @pytest.fixture(scope="module")
 def views(subject) -> Views:
     """Its training images."""
-    return Views.of(subject, 64)
+    return Views.of(subject, 64, with_masks=False)
 
 
 def make_head(subject: Subject, config: FitConfig) -> PersonalHead:
@@ -89,7 +89,7 @@ def test_every_face_starts_with_one_gaussian_at_its_centre(subject):
     appearance = make_appearance(subject)
     config = appearance.config.appearance
     posed = appearance.frozen.at_timestep(0)
-    gaussians, _ = appearance(posed, Views.of(subject, 64).cameras[0])
+    gaussians, _ = appearance(posed, Views.of(subject, 64, with_masks=False).cameras[0])
     faces = appearance.frozen.body.faces.long()
     assert torch.equal(appearance.gaussians.face_ids, torch.arange(len(faces)))
     assert torch.allclose(gaussians.means, posed.verts[faces].mean(1), atol=1e-7)
@@ -160,6 +160,9 @@ def test_the_channels_of_the_offset_maps():
 def test_offsets_change_what_they_say(subject, views):
     """A constant offset map moves, colours, turns, scales and fades every Gaussian by its channels."""
     appearance = make_appearance(subject)
+    local = Rotation.from_rotvec([0.9, -0.3, 0.4])
+    with torch.no_grad():
+        appearance.gaussians.quats.copy_(torch.tensor(local.as_quat()[[3, 0, 1, 2]]))
     posed, camera = appearance.frozen.at_timestep(0), views.cameras[0]
     before, _ = appearance(posed, camera)
     values = [0.1, -0.2, 0.3, 0.05, 0.06, -0.07, 0.02, 0.0, 0.0, 0.1, 0.2, -0.3, 0.5]
@@ -173,7 +176,7 @@ def test_offsets_change_what_they_say(subject, views):
         assert torch.allclose(after.scales, before.scales * torch.tensor(values[9:12]).exp(), rtol=1e-5)
         logits = torch.logit(after.opacities) - torch.logit(before.opacities)
         assert torch.allclose(logits, torch.tensor(0.5), atol=1e-4)
-        turned = R @ torch.tensor(Rotation.from_rotvec(values[6:9]).as_matrix()).float()
+        turned = R @ torch.tensor((local * Rotation.from_rotvec(values[6:9])).as_matrix()).float()
         found = Rotation.from_quat(after.quats[:, [1, 2, 3, 0]].numpy()).as_matrix()
         assert np.allclose(found, turned.numpy(), atol=1e-4)
         plain = appearance.color_net(
@@ -493,7 +496,5 @@ def test_a_stage_goes_on_from_its_state(subject, views, steps):
     other.load_state_dict(state)
     terms = [run(each, views, 4) for each in (stage, other)]
     assert terms[0] == terms[1]
-    for (name, a), b in zip(
-        stage.appearance.named_parameters(), other.appearance.parameters(), strict=True
-    ):
+    for (name, a), b in zip(stage.appearance.named_parameters(), other.appearance.parameters(), strict=True):
         assert torch.equal(a, b), name

@@ -33,6 +33,7 @@ from mgavatar.head.body import Body
 from mgavatar.head.procedural import build_head
 
 PAPER = {
+    "random_background": False,
     "loss.color": 0.8,  # lambda_c, Eq. 4 and 11
     "loss.ssim": 0.2,  # lambda_m, Eq. 4 and 11
     "geometry.iterations": 100_000,
@@ -41,6 +42,8 @@ PAPER = {
     "geometry.lambda_laplacian": 1e5,  # lambda_l, Eq. 7
     "geometry.hidden": 128,
     "geometry.pose_offsets": True,
+    "geometry.surface_shift": 0.0,  # Gaussians are at the vertices
+    "geometry.scales_follow_mesh": False,
     "appearance.iterations": 240_000,  # 340k in all
     "appearance.lambda_position": 0.01,  # lambda_mu, Eq. 11
     "appearance.lambda_scale": 1.0,  # lambda_s, Eq. 11
@@ -224,7 +227,9 @@ def test_dict_round_trip():
     assert from_dict({}) == FitConfig()
 
 
-@pytest.mark.parametrize("table", [{"log_evry": 1.0}, {"geometry": {"hiden": 1}}, {"appearance": {"density": {"x": 1}}}])
+@pytest.mark.parametrize(
+    "table", [{"log_evry": 1.0}, {"geometry": {"hiden": 1}}, {"appearance": {"density": {"x": 1}}}]
+)
 def test_a_stored_config_with_an_unknown_key_is_refused(table):
     """At any depth."""
     with pytest.raises(ValueError, match="unknown key"):

@@ -125,7 +125,7 @@ def test_a_fit_leaves_a_usable_avatar(whole, subject):
     assert avatar.appearance is not None
     assert avatar.n_gaussians > len(avatar.head.body.faces)
     frame = subject.frames["train"][0]
-    target = Views.of(subject, 64).images[0].float() / 255.0
+    target = Views.of(subject, 64, with_masks=False).images[0].float() / 255.0
     image = avatar.render(avatar.head.pose(frame.timestep), frame.camera).image
     assert (image - target).square().mean() < 0.5 * (1.0 - target).square().mean()
 
@@ -178,6 +178,29 @@ def test_ctrl_c_leaves_an_avatar_and_resume_ends_as_if_nothing_had_been(
     assert logs[0] == logs[1]
 
 
+def test_random_backgrounds_repeat_and_resume_too(subject, tmp_path, monkeypatch):
+    """The colour of an iteration depends on the seed and on nothing before it."""
+    config = replace(tiny_config(), random_background=True)
+    whole = fit_into(tmp_path / "whole", subject, config=config)
+    with at_step(monkeypatch, "geometry", 5, press_ctrl_c), pytest.raises(Interrupted):
+        fit_into(tmp_path / "run", subject, config=config)
+    assert differing(whole, fit_into(tmp_path / "run", subject, config=config, resume=True)) == []
+    plain = fit_into(tmp_path / "plain", subject)
+    assert "/geometry/colors" in differing(whole, plain)
+
+
+def test_a_target_on_another_background(subject):
+    """The subject keeps its colours, what is behind it takes the new one; without masks nothing changes."""
+    white, new = torch.ones(3), torch.tensor([0.2, 0.7, 0.4])
+    views = Views.of(subject, 64, with_masks=True)
+    image, mask = views.images[2].float() / 255.0, views.masks[2] == 255
+    assert 0 < mask.sum() < mask.numel()
+    target = views.target(2, white, new)
+    assert torch.allclose(target[:, mask], image[:, mask])
+    assert torch.allclose(target[:, ~mask], new[:, None].expand(3, int((~mask).sum())), atol=1e-6)
+    assert torch.equal(Views.of(subject, 64, with_masks=False).target(2, white, new), image)
+
+
 def test_two_interruptions(whole, subject, tmp_path, monkeypatch):
     """In both stages, one after the other."""
     with at_step(monkeypatch, "geometry", 7, press_ctrl_c), pytest.raises(Interrupted):
@@ -227,7 +250,7 @@ def test_a_crash_costs_what_came_after_the_last_checkpoint(stage, step, whole, s
 def test_a_loss_that_is_not_finite_stops_the_fit(subject, tmp_path):
     """With the stage, the step and what to do."""
     config = tiny_config(geometry={"lr_scale": 1e30})
-    with pytest.raises(DataError, match="geometry loss is not finite at iteration .*; lower the learning rates"):
+    with pytest.raises(DataError, match=r"geometry loss is not finite at iteration .*; lower the learning rates"):
         fit_into(tmp_path / "run", subject, config=config)
     assert not (tmp_path / "run" / "avatar.pt").exists()
 
@@ -317,9 +340,10 @@ def test_every_view_comes_once_in_a_pass():
 @pytest.mark.parametrize(("max_size", "side"), [(40, 40), (1000, 40), (20, 20), (17, 17)])
 def test_images_and_cameras_are_reduced_together(subject, max_size, side):
     """Never enlarged; what the camera sees stays where it was."""
-    views = Views.of(subject, max_size)
+    views = Views.of(subject, max_size, with_masks=True)
     assert views.images.shape == (6, 3, side, side)
     assert views.images.dtype == torch.uint8
+    assert views.masks.shape == (6, side, side)
     point = np.array([0.03, -0.02, 0.04, 1.0])
     for frame, camera in zip(subject.frames["train"], views.cameras, strict=True):
         assert (camera.width, camera.height) == (side, side)

@@ -34,7 +34,7 @@ def subject(tmp_path_factory) -> Subject:
 @pytest.fixture(scope="module")
 def views(subject) -> Views:
     """Its training images."""
-    return Views.of(subject, 64)
+    return Views.of(subject, 64, with_masks=False)
 
 
 def make_stage(subject: Subject, config: FitConfig) -> GeometryStage:
@@ -160,15 +160,16 @@ def test_vertex_gaussians_have_reduced_freedom(subject, views):
     stage = make_stage(subject, tiny_config())
     run(stage, views, 4)
     gaussians = stage.gaussians
-    bound = gaussians.bound(gaussians.head.posed(gaussians.head.pose(0)))
+    posed = gaussians.head.posed(gaussians.head.pose(0))
+    bound = gaussians.bound(posed)
     assert torch.equal(bound.opacities, torch.ones(gaussians.head.body.n_verts))
     assert torch.equal(bound.quats, torch.tensor([1.0, 0, 0, 0]).expand(len(bound.means), 4))
-    assert torch.equal(bound.scales, gaussians.log_scales.exp()[:, None].expand(-1, 3))
+    assert torch.equal(bound.scales, gaussians.scales(posed)[:, None].expand(-1, 3))
     assert torch.equal(bound.colors, 0.5 + SH_C0 * gaussians.colors)
-    assert SH_C0 == pytest.approx(0.5 / np.sqrt(np.pi))
+    assert pytest.approx(0.5 / np.sqrt(np.pi)) == SH_C0
 
 
-def test_gaussians_start_at_half_the_edges(subject):
+def test_gaussians_start_at_a_share_of_the_edges(subject):
     """The scale at the start goes by the mesh, and the colour is grey."""
     config = tiny_config(geometry={"initial_scale": 0.5})
     gaussians = make_stage(subject, config).gaussians
@@ -179,15 +180,25 @@ def test_gaussians_start_at_half_the_edges(subject):
 
 def test_gaussians_are_drawn_behind_the_surface(subject):
     """A shift of 0 draws at the vertices, as in the paper; a shift of 1 one sigma behind them."""
-    at, behind = (
-        make_stage(subject, tiny_config(geometry={"surface_shift": shift})).gaussians for shift in (0.0, 1.0)
-    )
+    at, behind = (make_stage(subject, tiny_config(geometry={"surface_shift": shift})).gaussians for shift in (0.0, 1.0))
     posed = at.head.posed(at.head.pose(0))
     assert torch.equal(at.bound(posed).means, posed.verts)
     moved = behind.bound(posed).means - posed.verts
     assert torch.allclose(moved.norm(dim=1), behind.log_scales.exp(), rtol=1e-4)
     inwards = posed.verts.mean(0) - posed.verts
     assert (moved * inwards).sum(1).min() > 0
+
+
+@pytest.mark.parametrize("follow", [False, True])
+def test_scales_that_follow_the_mesh(subject, follow):
+    """Where the canonical mesh is stretched to twice its size, its Gaussians grow with it; without the switch not."""
+    gaussians = make_stage(subject, tiny_config(geometry={"scales_follow_mesh": follow})).gaussians
+    posed = gaussians.head.posed(gaussians.head.pose(0))
+    assert torch.allclose(gaussians.scales(posed), gaussians.log_scales.exp(), rtol=1e-5)
+    stretched = replace(posed, identity_offsets=posed.shaped)
+    factor = 2.0 if follow else 1.0
+    assert torch.allclose(gaussians.scales(stretched), factor * gaussians.log_scales.exp(), rtol=1e-5)
+    assert torch.allclose(gaussians.bound(stretched).scales[:, 0], gaussians.scales(stretched))
 
 
 def test_the_shift_passes_no_gradient(subject):

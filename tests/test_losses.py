@@ -6,10 +6,10 @@ import pytest
 import torch
 from checks import assert_gradcheck, assert_matches_twin
 from torch import Tensor
+from twins import image as twins
 
 from mgavatar.config import ImageLossConfig
 from mgavatar.losses import image_loss, ssim
-from twins import image as twins
 
 
 def pair(*size: int, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:

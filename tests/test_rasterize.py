@@ -58,6 +58,7 @@ SCENES = {
     "wide image": lambda: ball_scene(150, (257, 31), seed=2),
     "small Gaussians": lambda: ball_scene(seed=3, sigma=0.02),
     "opaque": lambda: opaque(ball_scene(seed=4)),
+    "capped": lambda: opaque(ball_scene(seed=10)).knobs(alpha_cap=0.8),
     "needles": lambda: needles(ball_scene(seed=5)),
     "many layers": lambda: ball_scene(800, (41, 37), seed=6, sigma=0.2),
     "no truncation": lambda: ball_scene(seed=7).knobs(alpha_threshold=0.0, stop=0.0),

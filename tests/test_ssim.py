@@ -6,9 +6,9 @@ import pytest
 import torch
 from checks import assert_matches_twin, assert_same_bits
 from torch import Tensor
+from twins import image as twins
 
 from mgavatar.kernels.ssim import compare_images
-from twins import image as twins
 
 SIZES = ((1, 1), (3, 5), (10, 4), (11, 11), (16, 128), (17, 129), (33, 257))
 """Height and width: below the window's 11, at the border of a tile of 16 x 128, and past it."""

@@ -47,6 +47,7 @@ def tiny_config(*, geometry: dict[str, Any] | None = None, appearance: dict[str,
     """Few iterations and small networks, with density control at work."""
     g: dict[str, Any] = {
         "iterations": 12, "triplane_resolution": 16, "triplane_channels": 4, "hidden": 16, "lr_pose": 1e-4,
+        "surface_shift": 1.0,
     }  # fmt: skip
     a: dict[str, Any] = {
         "iterations": 12,

@@ -22,14 +22,24 @@ class VertexGaussians(nn.Module):
         self.head = head
         self.config = config
         edges = head.body.edge_lengths(head.body.shaped(head.betas.detach()))
-        typical = edges[edges > 0].median()
-        self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges.clamp(min=0.2 * typical)))
+        edges = edges.clamp(min=0.2 * float(edges[edges > 0].median()))
+        self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges))
         self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
+        self.start_edges: Tensor
+        self.register_buffer("start_edges", edges)
+
+    def scales(self, posed: PosedHead) -> Tensor:
+        """Sigma of every Gaussian [m], shape [V]."""
+        scales = self.log_scales.exp()
+        if not self.config.geometry.scales_follow_mesh:
+            return scales
+        edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
+        return scales * (edges / self.start_edges)
 
     def bound(self, posed: PosedHead) -> Gaussians:
         """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas."""
         verts = posed.verts
-        scales = self.log_scales.exp()
+        scales = self.scales(posed)
         shift = self.config.geometry.surface_shift
         if shift:
             verts = verts - shift * scales.detach()[:, None] * self.head.body.normals(verts)
@@ -86,7 +96,7 @@ class GeometryStage:
         head = self.gaussians.head
         posed = head.posed(head.pose(timestep))
         image = self.gaussians.render(posed, camera, background).image
-        scales = self.gaussians.log_scales.exp()
+        scales = self.gaussians.scales(posed)
         image_term = image_loss(image, target, self.config.loss)
         offset_term = g.lambda_offset * offset_loss(posed, scales)
         laplacian_term = g.lambda_laplacian * laplacian_loss(self.gaussians, posed, scales)

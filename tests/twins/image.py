@@ -23,9 +23,7 @@ def blurred(x: Tensor) -> Tensor:
     padded = torch.nn.functional.pad(x, (RADIUS,) * 4)
     weights = window().to(x.dtype)
     size = 2 * RADIUS + 1
-    shifted = [
-        weights[j, i] * padded[:, j : j + height, i : i + width] for j in range(size) for i in range(size)
-    ]
+    shifted = [weights[j, i] * padded[:, j : j + height, i : i + width] for j in range(size) for i in range(size)]
     return torch.stack(shifted).sum(0)
 
 

@@ -1,0 +1,83 @@
+"""The benchmark: its plain forms compute the same, its table and JSON hold what was measured."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from mgavatar import bench, bench_work
+from mgavatar.kernels import bridge
+
+CPU = torch.device("cpu")
+
+
+def loss_of(step):
+    """The value whose backward pass a step returns."""
+    return float(step().__self__.detach())
+
+
+@pytest.mark.parametrize(
+    "job",
+    [
+        bench_work.raster_job("rasterize", 2000, (64, 48), CPU),
+        bench_work.raster_job("rasterize, opaque", 2000, (64, 48), CPU, opaque=True),
+        bench_work.lbs_job(CPU, n_verts=2000, n_dirs=9),
+        *bench_work.mesh_jobs(CPU),
+    ],
+    ids=lambda job: job.name,
+)
+def test_plain_forms_compute_the_same(job):
+    """Otherwise the ratio means nothing."""
+    value = loss_of(job.step)
+    assert value > 0
+    assert loss_of(job.plain) == pytest.approx(value, rel=1e-4)
+
+
+def test_the_hash_grid_and_its_plain_form_take_the_same_steps():
+    """Both step an optimizer, so that the loss falls."""
+    job = bench_work.hash_grid_job(CPU, n=500, log2_table_size=10)
+    for step in (job.step, job.plain):
+        for _ in range(2):
+            step()()
+
+
+def test_the_head_scene_covers_the_image_alike_for_any_number():
+    """Pixels inside ellipses hardly depend on N: sizes shrink as numbers grow."""
+    few, many = (bench_work.raster_job("", n, (512, 512), CPU).operations for n in (5000, 20_000))
+    assert 0.5 < few / many < 2
+    assert few / sum(bench_work.RASTER_OPERATIONS) > 5e6
+
+
+def test_exponent_of_a_power_law():
+    """Slope of the logarithms."""
+    assert bench._exponent([1, 10, 100], [2, 2 * 10**1.5, 2 * 10**3]) == pytest.approx(1.5)
+
+
+def test_table_and_json(monkeypatch, tmp_path):
+    """One small row goes all the way; threads are put back."""
+    monkeypatch.setattr(bench, "jobs", lambda device: iter([bench_work.raster_job("rasterize", 500, (32, 32), device)]))
+    monkeypatch.setattr(bench, "_exponents", lambda device: {"Gaussians": 1.0})
+    share = bench._blending_share
+    monkeypatch.setattr(bench, "_blending_share", lambda n, size, device: share(n // 40, (64, 64), device))
+    before = bridge.num_threads()
+    text = bench.bench_kernels(threads=1, json_path=tmp_path / "bench.json")
+    assert bridge.num_threads() == before
+    report = json.loads((tmp_path / "bench.json").read_text())
+    (row,) = report["rows"]
+    assert {"device", "commit", "rows"} <= set(report)
+    assert set(row) == {
+        "name", "work", "threads", "forward_ms", "backward_ms", "spread", "floor_ms", "plain_ms"
+    }  # fmt: skip
+    assert row["threads"] == 1
+    assert min(row["forward_ms"], row["backward_ms"], row["floor_ms"], row["plain_ms"]) > 0
+    assert "rasterize" in text
+    assert "exponents of its time: Gaussians 1.00" in text
+    assert 0 < report["blending_share"] < 1.5
+
+
+def test_no_threads_are_refused():
+    """As the kernels themselves refuse them."""
+    with pytest.raises(ValueError, match="at least 1"):
+        bench.bench_kernels(threads=0)

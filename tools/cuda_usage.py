@@ -1,0 +1,93 @@
+"""Print what each kernel takes on a CUDA device, from binaries that are compiled without one.
+
+    python tools/cuda_usage.py [75 90 ...]
+
+Registers, static shared memory and local memory (spills and stack) are read from the sections of the ELF files that
+NVRTC writes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import struct
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import warp as wp
+
+import mgavatar.kernels
+
+REGISTERS, FRAME_SIZE = 0x2F, 0x11
+"""Attributes of section .nv.info: one entry a function, symbol index and value."""
+
+
+def _sections(elf: bytes) -> Iterator[tuple[str, bytes, int]]:
+    """Name, contents and size of each section of a 64-bit little-endian ELF file."""
+    offset = struct.unpack_from("<Q", elf, 0x28)[0]
+    size, count, names_at = struct.unpack_from("<HHH", elf, 0x3A)
+    headers = [struct.unpack_from("<IIQQQQIIQQ", elf, offset + i * size) for i in range(count)]
+    names = headers[names_at][4]
+    for name, kind, _, _, start, length, *_ in headers:
+        text = elf[names + name : elf.index(b"\0", names + name)].decode()
+        yield text, b"" if kind == 8 else elf[start : start + length], length
+
+
+def _attributes(info: bytes) -> Iterator[tuple[int, int, int]]:
+    """Attribute, symbol and value of the entries of .nv.info that have both."""
+    at = 0
+    while at + 4 <= len(info):
+        form, attribute, size = struct.unpack_from("<BBH", info, at)
+        at += 4
+        if form == 4:  # a payload of that size follows; otherwise the value is in the header
+            if size == 8:
+                yield attribute, *struct.unpack_from("<II", info, at)
+            at += size
+
+
+def usage(cubin: bytes) -> dict[str, tuple[int, int, int]]:
+    """Registers, shared bytes and local bytes of each kernel."""
+    sections = {name: (contents, length) for name, contents, length in _sections(cubin)}
+    symbols, names = sections[".symtab"][0], sections[".strtab"][0]
+    starts = [struct.unpack_from("<I", symbols, 24 * i)[0] for i in range(len(symbols) // 24)]
+    by_symbol = [names[start : names.index(b"\0", start)].decode() for start in starts]
+    found: dict[str, dict[int, int]] = {}
+    for attribute, symbol, value in _attributes(sections[".nv.info"][0]):
+        found.setdefault(by_symbol[symbol], {})[attribute] = value
+    shared = {
+        name.removeprefix(".nv.shared."): length for name, (_, length) in sections.items() if ".nv.shared." in name
+    }
+    return {
+        name: (values.get(REGISTERS, 0), shared.get(name, 0), values.get(FRAME_SIZE, 0))
+        for name, values in found.items()
+        if f".text.{name}" in sections
+    }
+
+
+def _modules() -> list[wp.Module]:
+    folder = Path(mgavatar.kernels.__file__).parent
+    for path in sorted(folder.glob("*.py")):
+        if path.stem != "__init__":
+            importlib.import_module(f"mgavatar.kernels.{path.stem}")
+    known = wp._src.context.user_modules.values()
+    return [m for m in known if m.name.startswith("mgavatar.kernels") and m.kernels]
+
+
+def main() -> None:
+    """Print one line a kernel."""
+    architectures = [int(a) for a in sys.argv[1:]] or [90]
+    print("| kernel | arch | registers | shared bytes | local bytes |\n|---|---|---|---|---|")
+    for module in _modules():
+        with tempfile.TemporaryDirectory() as folder:
+            wp.compile_aot_module(module, arch=architectures, module_dir=folder, use_ptx=False)
+            for path in sorted(Path(folder).glob("*.cubin")):
+                arch = path.name.split(".sm")[-1].split(".")[0]
+                for name, numbers in sorted(usage(path.read_bytes()).items()):
+                    kernel = name.removeprefix("_kernels__locals__").split("_kernel_")[0].strip("_")
+                    short = f"{module.name.removeprefix('mgavatar.kernels.')}: {kernel}"
+                    print(f"| {short} | {arch} | " + " | ".join(str(n) for n in numbers) + " |")
+
+
+if __name__ == "__main__":
+    main()
