@@ -28,7 +28,7 @@ class RasterSettings:
     alpha_threshold: float = 1.0 / 255.0
     """Contributions below this alpha are skipped; 0 blends every Gaussian with every pixel."""
     stop: float = 1e-4
-    """A pixel ends after the Gaussian that takes its transmittance below this; 0 never ends it."""
+    """A pixel ends after the Gaussian that takes its transmittance below this; 0 means 1e-30."""
     alpha_cap: float = 0.9999
     """Largest alpha of one Gaussian at one pixel."""
     low_pass: float = 0.3

@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from mgavatar.kernels.bridge import torch_stream, launch_ranges, to_warp
+from mgavatar.kernels.bridge import launch_ranges, to_warp, torch_stream
 
 wp.set_module_options({"enable_backward": False})
 

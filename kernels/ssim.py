@@ -50,7 +50,7 @@ _COMMON = """
             for (int i = first; i < past; ++i) to[j * STRIDE + i] = source[plane + y * width + x0 + i - R];
         }
     };
-""" % (_WIDTH, _HEIGHT)  # noqa: UP031  braces belong to C here
+""" % (_WIDTH, _HEIGHT)
 
 _FORWARD = (
     "#if !defined(__CUDACC__)\n"

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mgavatar.camera import Camera
 from mgavatar.config import RasterConfig
-from mgavatar.kernels.rasterize import Rendering, RasterSettings, rasterize
+from mgavatar.kernels.rasterize import RasterSettings, Rendering, rasterize
 
 SH_C0 = 0.28209479177387814
 """Y_00, the constant spherical harmonic."""

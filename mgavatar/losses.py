@@ -1,4 +1,4 @@
-"""Photometric losses: mean absolute error and SSIM as 3D Gaussian splatting defines it (11x11, sigma 1.5, zero padding)."""
+"""Photometric losses: mean absolute error, and SSIM as in 3D Gaussian splatting (11x11, sigma 1.5, zero padding)."""
 
 from __future__ import annotations
 

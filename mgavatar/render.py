@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
-from mgavatar.capture.vhap import _camera, _Reader
+from mgavatar.capture.vhap import FrameReader, camera_of_frame
 from mgavatar.driving import Driving, ExpressionMode, driving_expression
 from mgavatar.errors import DataError
 from mgavatar.files import read_json
@@ -267,10 +267,10 @@ def _cameras_of_file(path: Path, n_frames: int, avatar: Avatar) -> list[Camera]:
 
 
 def _camera_of_entry(path: Path, meta: dict[str, Any], entry: dict[str, Any], index: int, avatar: Avatar) -> Camera:
-    reader = _Reader(path, meta, entry, str(index))
+    reader = FrameReader(path, meta, entry, str(index))
     if "transform_matrix" not in entry:
         raise DataError(f"{path}: frame {index} has no transform_matrix, camera to world in OpenGL axes")
-    return _camera(reader, avatar.config.principal_point)
+    return camera_of_frame(reader, avatar.config.principal_point)
 
 
 def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:

@@ -95,7 +95,7 @@ class _Entry:
         return Frame(self.image_path, self.mask_path, self.camera, self.camera_id, row_of[self.timestep_id])
 
 
-class _Reader:
+class FrameReader:
     """One frame of a transforms file: its values, else those at the top of the file, with messages that name both."""
 
     def __init__(self, path: Path, meta: dict[str, Any], frame: dict[str, Any], label: str) -> None:
@@ -136,7 +136,7 @@ def _split_entries(root: Path, split: Split, principal_point: PrincipalPoint) ->
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: frame {index} is no object")
-        reader = _Reader(path, meta, frame, one_line(frame.get("file_path") or index, limit=80))
+        reader = FrameReader(path, meta, frame, one_line(frame.get("file_path") or index, limit=80))
         off_centre += _is_off_centre(reader)
         yield _entry(reader, split=split, principal_point=principal_point)
     if off_centre and principal_point == "center":
@@ -148,7 +148,7 @@ def _split_entries(root: Path, split: Split, principal_point: PrincipalPoint) ->
         )
 
 
-def _entry(reader: _Reader, *, split: Split, principal_point: PrincipalPoint) -> _Entry:
+def _entry(reader: FrameReader, *, split: Split, principal_point: PrincipalPoint) -> _Entry:
     if "file_path" not in reader.values:
         raise DataError(f"{reader.where} has no file_path")
     if reader.values.get("flame_param_path") is None:
@@ -159,20 +159,20 @@ def _entry(reader: _Reader, *, split: Split, principal_point: PrincipalPoint) ->
         image_path=reader.file("file_path"),
         mask_path=reader.file("fg_mask_path") if reader.values.get("fg_mask_path") else None,
         params_path=reader.file("flame_param_path"),
-        camera=_camera(reader, principal_point),
+        camera=camera_of_frame(reader, principal_point),
         camera_id=reader.whole("camera_index", low=0) if "camera_index" in reader.values else 0,
         timestep_id=reader.whole("timestep_index", low=0),
     )
 
 
-def _is_off_centre(reader: _Reader) -> bool:
+def _is_off_centre(reader: FrameReader) -> bool:
     if not all(reader.has(key) for key in ("cx", "cy", "w", "h")):
         return False
     cx, cy, width, height = (reader.number(key) for key in ("cx", "cy", "w", "h"))
     return max(abs(cx - width / 2), abs(cy - height / 2)) > 0.01 * width
 
 
-def _camera(reader: _Reader, principal_point: PrincipalPoint) -> Camera:
+def camera_of_frame(reader: FrameReader, principal_point: PrincipalPoint) -> Camera:
     """Camera-to-world in OpenGL axes (y up, z backwards) to world-to-camera in OpenCV axes, and the intrinsics."""
     width, height = (reader.whole(key, low=1, high=MAX_PIXELS) for key in ("w", "h"))
     if width * height > MAX_PIXELS:
@@ -189,7 +189,7 @@ def _camera(reader: _Reader, principal_point: PrincipalPoint) -> Camera:
     return Camera(_viewmat(reader), K, width, height)
 
 
-def _focal(reader: _Reader, width: int) -> float:
+def _focal(reader: FrameReader, width: int) -> float:
     if reader.has("fl_x"):
         return reader.number("fl_x")
     angle = reader.number("camera_angle_x")
@@ -198,7 +198,7 @@ def _focal(reader: _Reader, width: int) -> float:
     return 0.5 * width / math.tan(0.5 * angle)
 
 
-def _viewmat(reader: _Reader) -> np.ndarray:
+def _viewmat(reader: FrameReader) -> np.ndarray:
     try:
         pose = np.array(reader.values.get("transform_matrix"), np.float64)
     except (ValueError, TypeError, OverflowError):

@@ -17,7 +17,6 @@ from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
-
 FINE_ENOUGH = 12_000
 """Vertices; the paper's mesh has 20K."""
 
