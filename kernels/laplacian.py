@@ -7,7 +7,7 @@ from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 
 def laplacian_matrix(faces: Tensor, n_verts: int) -> SparseMatrix:
-    """Build the neighbour-mean Laplacian ``x_i - mean of x over the neighbours of i`` (Eq. 7).
+    """Build the neighbour-mean Laplacian ``x_i - mean of x over the neighbours of i`` (Eq. 6).
 
     Neighbours share an edge, counted once however many faces it has, so a rim vertex averages over its rim and inner
     neighbours alike. A vertex without neighbours has a row of zeros.
@@ -40,7 +40,7 @@ def laplacian_matrix(faces: Tensor, n_verts: int) -> SparseMatrix:
 
 
 def laplacian(matrix: SparseMatrix, x: Tensor) -> Tensor:
-    """Laplacian of any per-vertex values (Eq. 7). Differentiable in ``x``.
+    """Laplacian of any per-vertex values (Eq. 6). Differentiable in ``x``.
 
     Args:
         matrix: Made by :func:`laplacian_matrix`, shape [V, V].

@@ -59,7 +59,9 @@ def _cover_kernel(
         for i in range(cols[0], cols[1]):
             p = wp.vec2d(wp.float64(i) + wp.float64(0.5), wp.float64(j) + wp.float64(0.5))
             weights = _barycentric(a, b, c, p)
-            if wp.min(weights) >= wp.float64(-_EDGE):
+            least = wp.float64(-_EDGE)
+            # One by one: a face without area has NaN among its weights, and a minimum may hide it.
+            if weights[0] >= least and weights[1] >= least and weights[2] >= least:
                 wp.atomic_min(face_ids, j * width + i, f)
 
 

@@ -16,7 +16,7 @@ from mgavatar import __version__
 from mgavatar.appearance.model import Appearance, FrozenHead
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import HeadParams, Subject
-from mgavatar.config import FitConfig, from_dict
+from mgavatar.config import FitConfig, check, from_dict
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file
 from mgavatar.gaussians import Gaussians, draw
@@ -153,7 +153,7 @@ class Avatar:
         existing_file(path)
         payload = _read(path)
         try:
-            config = from_dict(payload["config"])
+            config = _config(payload["config"])
             arrays = {
                 name: value.numpy() if isinstance(value, Tensor) else np.array(value)
                 for name, value in payload["head"].items()
@@ -266,6 +266,15 @@ def _capture_of(state: dict[str, Any]) -> CaptureInfo:
     if len(ids) != len(tracked["expr"]) or not all(0 <= timestep < len(ids) for timestep in train):
         raise ValueError("timesteps do not fit the tracked parameters")
     return CaptureInfo(HeadParams(**tracked), ids, train, cameras, background)
+
+
+def _config(table: dict[str, Any]) -> FitConfig:
+    config = from_dict(table)
+    try:
+        check(config)
+    except DataError as error:
+        raise ValueError(str(error)) from error
+    return config
 
 
 def _brief(error: Exception) -> str:

@@ -22,7 +22,8 @@ class VertexGaussians(nn.Module):
         self.head = head
         self.config = config
         edges = head.body.edge_lengths(head.body.shaped(head.betas.detach()))
-        edges = edges.clamp(min=0.2 * float(edges[edges > 0].median()))
+        self.least_edge = 0.2 * float(edges[edges > 0].median())
+        edges = edges.clamp(min=self.least_edge)
         self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges))
         self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
         self.start_edges: Tensor
@@ -34,7 +35,7 @@ class VertexGaussians(nn.Module):
         if not self.config.geometry.scales_follow_mesh:
             return scales
         edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
-        return scales * (edges / self.start_edges)
+        return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
     def bound(self, posed: PosedHead) -> Gaussians:
         """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas."""
@@ -105,6 +106,8 @@ class GeometryStage:
         loss.backward()
         self.optimizer.step()
         self.schedule.step()
+        if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn, so no other term would tell
+            loss = loss * torch.nan
         terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()
         return dict(zip(("loss", "image", "offset", "laplacian"), terms, strict=True)) | {"gaussians": len(scales)}
 
