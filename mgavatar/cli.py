@@ -306,12 +306,33 @@ def _as_json(metrics: dict[str, Any]) -> str:
     return json.dumps(metrics, indent=2)
 
 
+def bench(
+    what: Annotated[Literal["kernels"], tyro.conf.Positional],
+    *,
+    threads: int | None = None,
+    json: Path | None = None,
+    device: Device = "cpu",
+) -> None:
+    """Measure this machine: ``kernels`` against their plain form and the machine's floor, in one run.
+
+    Args:
+        what: What to measure.
+        threads: CPU threads of the kernels, all cores by default.
+        json: Also write the rows here.
+        device: Where to compute.
+    """
+    from mgavatar.bench import bench_kernels
+
+    print(bench_kernels(threads=threads, json_path=json, device=_device(device).type))
+
+
 _COMMANDS: dict[str, Callable[..., None]] = {
     "demo": demo,
     "synth": synth,
     "fit": fit,
     "render": render,
     "evaluate": evaluate,
+    "bench": bench,
 }
 
 

@@ -148,12 +148,35 @@ class AppearanceConfig:
     offset_net: OffsetNetConfig = field(default_factory=OffsetNetConfig)
 
 
+Accuracy = Literal["exact", "accurate", "balanced", "fast"]
+
+ACCURACY: dict[Accuracy, tuple[float, float]] = {
+    "exact": (0.0, 0.0),
+    "accurate": (1.0 / 1024.0, 1e-4),
+    "balanced": (1.0 / 255.0, 1e-4),
+    "fast": (1.0 / 64.0, 1e-2),
+}
+"""Alpha threshold and stop of each level; ``docs/tradeoffs.md`` has what they cost and save."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RasterConfig:
     """What the rasterizer may leave out (``kernels/rasterize.py``)."""
 
-    alpha_threshold: float = 1.0 / 255.0
-    stop: float = 1e-4
+    accuracy: Accuracy = "balanced"
+    """Level of :data:`ACCURACY`: from every contribution of every Gaussian (hundreds of times slower) to few of them."""
+    alpha_threshold: float | None = None
+    """Contributions below this alpha are skipped; by default as the level says."""
+    stop: float | None = None
+    """A pixel ends once its transmittance is below this; by default as the level says."""
+
+    def thresholds(self) -> tuple[float, float]:
+        """Alpha threshold and stop: the level's, unless given."""
+        alpha_threshold, stop = ACCURACY[self.accuracy]
+        return (
+            alpha_threshold if self.alpha_threshold is None else self.alpha_threshold,
+            stop if self.stop is None else self.stop,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,6 +244,8 @@ def to_toml(config: Any, prefix: str = "") -> str:
     plain, nested = [], []
     for entry in dataclasses.fields(config):
         value = getattr(config, entry.name)
+        if value is None:  # TOML has no word for it; left out, it is the default
+            continue
         if dataclasses.is_dataclass(value):
             nested.append(f"\n[{prefix}{entry.name}]\n{to_toml(value, f'{prefix}{entry.name}.')}")
         else:
@@ -260,6 +285,9 @@ def check(config: FitConfig) -> None:
         DataError: Naming the key and its range.
     """
     g, a = config.geometry, config.appearance
+    if config.raster.accuracy not in ACCURACY:
+        raise DataError(f"--raster.accuracy {config.raster.accuracy}: must be one of {', '.join(ACCURACY)}")
+    alpha_threshold, stop = config.raster.thresholds()
     bounds = (
         ("geometry.iterations", g.iterations, 1, 10_000_000),
         ("geometry.max-image-size", g.max_image_size, 16, 65_536),
@@ -276,8 +304,8 @@ def check(config: FitConfig) -> None:
         ("appearance.color-net.log2-table-size", a.color_net.log2_table_size, 4, 24),
         ("appearance.offset-net.resolution", a.offset_net.resolution, 16, 1024),
         ("appearance.density.every", a.density.every, 1, 10_000_000),
-        ("raster.alpha-threshold", config.raster.alpha_threshold, 0.0, 0.5),
-        ("raster.stop", config.raster.stop, 0.0, 0.5),
+        ("raster.alpha-threshold", alpha_threshold, 0.0, 0.5),
+        ("raster.stop", stop, 0.0, 0.5),
         ("log-every", config.log_every, 1, 10_000_000),
     )
     for name, value, low, high in bounds:

@@ -45,6 +45,7 @@ def draw(
 ) -> Rendering:
     """Rasterize Gaussians from a camera; see :func:`mgavatar.kernels.rasterize.rasterize`."""
     device = gaussians.means.device
+    alpha_threshold, stop = config.thresholds()
     return rasterize(
         gaussians.means,
         gaussians.quats,
@@ -55,6 +56,6 @@ def draw(
         K=torch.from_numpy(camera.K.astype(np.float32)).to(device),
         size=(camera.width, camera.height),
         background=background,
-        settings=RasterSettings(alpha_threshold=config.alpha_threshold, stop=config.stop),
+        settings=RasterSettings(alpha_threshold=alpha_threshold, stop=stop),
         screen_grads=screen_grads,
     )
