@@ -75,24 +75,26 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         tile_end: wp.array[wp.int32],  # [T]
         items: wp.array[wp.int32],  # [M]
         item_splat: wp.array[wp.int32],  # [M]
-        background: wp.array[real],  # [3]
+        background: wp.array2d[real],  # [B, 3]
         n_columns: int,
+        tiles_per_view: int,
         alpha_threshold: real,
         stop: real,
         cap: real,
         # Out:
-        image: wp.array3d[real],  # [3, H, W]
-        coverage: wp.array2d[real],  # [H, W]
-        depths: wp.array2d[real],  # [H, W] sum of weight times depth
-        final_T: wp.array2d[real],  # [H, W]
-        last: wp.array2d[wp.int32],  # [H, W] entry of items last accepted, -1 if none
+        image: wp.array4d[real],  # [B, 3, H, W]
+        coverage: wp.array3d[real],  # [B, H, W]
+        depths: wp.array3d[real],  # [B, H, W] sum of weight times depth
+        final_T: wp.array3d[real],  # [B, H, W]
+        last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
     ):
         thread = wp.tid()
         tile = thread // BLOCK
         lane = thread % BLOCK
-        x = (tile % n_columns) * TILE + lane % TILE
-        y = (tile // n_columns) * TILE + lane // TILE
-        if x >= image.shape[2] or y >= image.shape[1]:
+        b = tile // tiles_per_view
+        x = (tile % tiles_per_view % n_columns) * TILE + lane % TILE
+        y = (tile % tiles_per_view // n_columns) * TILE + lane // TILE
+        if x >= image.shape[3] or y >= image.shape[2]:
             return
         T = real(1.0)
         red, green, blue, depth = real(0.0), real(0.0), real(0.0), real(0.0)
@@ -109,13 +111,13 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
                     depth += weight * splats[n, 11]
                     T = T * (real(1.0) - alpha)  # T - weight would lose it to rounding when alpha is near 1
                     accepted = k
-        image[0, y, x] = red + T * background[0]
-        image[1, y, x] = green + T * background[1]
-        image[2, y, x] = blue + T * background[2]
-        coverage[y, x] = real(1.0) - T
-        depths[y, x] = depth
-        final_T[y, x] = T
-        last[y, x] = accepted
+        image[b, 0, y, x] = red + T * background[b, 0]
+        image[b, 1, y, x] = green + T * background[b, 1]
+        image[b, 2, y, x] = blue + T * background[b, 2]
+        coverage[b, y, x] = real(1.0) - T
+        depths[b, y, x] = depth
+        final_T[b, y, x] = T
+        last[b, y, x] = accepted
 
     @wp.kernel(module=module, enable_backward=False)
     def composite_bwd_kernel(
@@ -125,34 +127,36 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         tile_end: wp.array[wp.int32],  # [T]
         items: wp.array[wp.int32],  # [M]
         item_splat: wp.array[wp.int32],  # [M]
-        background: wp.array[real],  # [3]
+        background: wp.array2d[real],  # [B, 3]
         n_columns: int,
+        tiles_per_view: int,
         alpha_threshold: real,
         cap: real,
-        final_T: wp.array2d[real],  # [H, W]
-        last: wp.array2d[wp.int32],  # [H, W]
-        v_image: wp.array3d[real],  # [3, H, W]
-        v_coverage: wp.array2d[real],  # [H, W]
-        v_depths: wp.array2d[real],  # [H, W]
+        final_T: wp.array3d[real],  # [B, H, W]
+        last: wp.array3d[wp.int32],  # [B, H, W]
+        v_image: wp.array4d[real],  # [B, 3, H, W]
+        v_coverage: wp.array3d[real],  # [B, H, W]
+        v_depths: wp.array3d[real],  # [B, H, W]
         # Out:
         partials: wp.array2d[real],  # [M, 10] zero at first
     ):
         thread = wp.tid()
         tile = thread // BLOCK
         lane = thread % BLOCK
-        x = (tile % n_columns) * TILE + lane % TILE
-        y = (tile // n_columns) * TILE + lane // TILE
+        b = tile // tiles_per_view
+        x = (tile % tiles_per_view % n_columns) * TILE + lane % TILE
+        y = (tile % tiles_per_view // n_columns) * TILE + lane // TILE
         T = real(1.0)
         v_red, v_green, v_blue, v_depth, behind = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
         accepted = wp.int32(-1)
-        if x < v_image.shape[2] and y < v_image.shape[1]:
-            T = final_T[y, x]
-            v_red = v_image[0, y, x]
-            v_green = v_image[1, y, x]
-            v_blue = v_image[2, y, x]
-            v_depth = v_depths[y, x]
-            behind = v_red * background[0] + v_green * background[1] + v_blue * background[2] - v_coverage[y, x]
-            accepted = last[y, x]
+        if x < v_image.shape[3] and y < v_image.shape[2]:
+            T = final_T[b, y, x]
+            v_red = v_image[b, 0, y, x]
+            v_green = v_image[b, 1, y, x]
+            v_blue = v_image[b, 2, y, x]
+            v_depth = v_depths[b, y, x]
+            behind = v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_coverage[b, y, x]
+            accepted = last[b, y, x]
         # Every thread of the block walks the same entries: the block sums need all of them.
         for step in range(tile_end[tile] - tile_begin[tile]):
             k = tile_end[tile] - 1 - step

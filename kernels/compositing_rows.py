@@ -47,7 +47,8 @@ _COMMON = """
         __builtin_memcpy(&scale, &bits, sizeof(scale));
         return p * scale;
     };
-    const int x0 = (tile %% n_columns) * TW, y0 = (tile / n_columns) * TH;
+    const int per_view = n_columns * ((height + TH - 1) / TH), view = tile / per_view, local = tile %% per_view;
+    const int x0 = (local %% n_columns) * TW, y0 = (local / n_columns) * TH;
     const int x1 = x0 + TW < width ? x0 + TW : width, y1 = y0 + TH < height ? y0 + TH : height;
     const int begin = tile_begin.data[tile], end = tile_end.data[tile];
     const float threshold = alpha_threshold;
@@ -126,14 +127,16 @@ _FORWARD = (
             }
         }
     }
-    const float b0 = background.data[0], b1 = background.data[1], b2 = background.data[2];
-    const int plane = width * height;
+    const float* back = &background.data[3 * view];
+    const float b0 = back[0], b1 = back[1], b2 = back[2];
+    const long long plane = (long long)width * height;
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
-            image.data[o] = red[i] + T[i] * b0;
-            image.data[plane + o] = green[i] + T[i] * b1;
-            image.data[2 * plane + o] = blue[i] + T[i] * b2;
+            const int i = (y - y0) * STRIDE + x - x0;
+            const long long o = view * plane + y * width + x, c = o + 2 * view * plane;
+            image.data[c] = red[i] + T[i] * b0;
+            image.data[c + plane] = green[i] + T[i] * b1;
+            image.data[c + 2 * plane] = blue[i] + T[i] * b2;
             coverage.data[o] = 1.0f - T[i];
             depths.data[o] = depth[i];
             final_T.data[o] = T[i];
@@ -151,8 +154,9 @@ _BACKWARD = (
     + """
     float T[SIZE], v_red[SIZE], v_green[SIZE], v_blue[SIZE], v_depth[SIZE], behind[SIZE];
     int accepted[SIZE];
-    const float b0 = background.data[0], b1 = background.data[1], b2 = background.data[2];
-    const int plane = width * height;
+    const float* back = &background.data[3 * view];
+    const float b0 = back[0], b1 = back[1], b2 = back[2];
+    const long long plane = (long long)width * height;
     int furthest = -1;
     for (int i = 0; i < SIZE; ++i) {
         T[i] = v_red[i] = v_green[i] = v_blue[i] = v_depth[i] = behind[i] = 0.0f;
@@ -160,11 +164,12 @@ _BACKWARD = (
     }
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
+            const int i = (y - y0) * STRIDE + x - x0;
+            const long long o = view * plane + y * width + x, c = o + 2 * view * plane;
             T[i] = final_T.data[o];
-            v_red[i] = v_image.data[o];
-            v_green[i] = v_image.data[plane + o];
-            v_blue[i] = v_image.data[2 * plane + o];
+            v_red[i] = v_image.data[c];
+            v_green[i] = v_image.data[c + plane];
+            v_blue[i] = v_image.data[c + 2 * plane];
             v_depth[i] = v_depths.data[o];
             behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_coverage.data[o];
             accepted[i] = last.data[o];
@@ -236,20 +241,20 @@ _BACKWARD = (
 @wp.func_native(_FORWARD)
 def _composite_tile(
     tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array[wp.float32], n_columns: int,
+    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
     width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
-    image: wp.array3d[wp.float32], coverage: wp.array2d[wp.float32], depths: wp.array2d[wp.float32],
-    final_T: wp.array2d[wp.float32], last: wp.array2d[wp.int32],
+    image: wp.array4d[wp.float32], coverage: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
+    final_T: wp.array3d[wp.float32], last: wp.array3d[wp.int32],
 ): ...  # fmt: skip
 
 
 @wp.func_native(_BACKWARD)
 def _composite_tile_bwd(
     tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array[wp.float32], n_columns: int,
-    width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array2d[wp.float32],
-    last: wp.array2d[wp.int32], v_image: wp.array3d[wp.float32], v_coverage: wp.array2d[wp.float32],
-    v_depths: wp.array2d[wp.float32], partials: wp.array2d[wp.float32],
+    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
+    width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array3d[wp.float32],
+    last: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32], v_coverage: wp.array3d[wp.float32],
+    v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
 ): ...  # fmt: skip
 
 
@@ -262,21 +267,21 @@ def composite_rows_kernel(
     tile_end: wp.array[wp.int32],  # [T]
     items: wp.array[wp.int32],  # [M]
     item_splat: wp.array[wp.int32],  # [M]
-    background: wp.array[wp.float32],  # [3]
+    background: wp.array2d[wp.float32],  # [B, 3]
     n_columns: int,
     alpha_threshold: wp.float32,
     stop: wp.float32,
     cap: wp.float32,
     # Out:
-    image: wp.array3d[wp.float32],  # [3, H, W]
-    coverage: wp.array2d[wp.float32],  # [H, W]
-    depths: wp.array2d[wp.float32],  # [H, W] sum of weight times depth
-    final_T: wp.array2d[wp.float32],  # [H, W]
-    last: wp.array2d[wp.int32],  # [H, W] entry of items last accepted, -1 if none
+    image: wp.array4d[wp.float32],  # [B, 3, H, W]
+    coverage: wp.array3d[wp.float32],  # [B, H, W]
+    depths: wp.array3d[wp.float32],  # [B, H, W] sum of weight times depth
+    final_T: wp.array3d[wp.float32],  # [B, H, W]
+    last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
 ):
     _composite_tile(
         first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        image.shape[2], image.shape[1], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
+        image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
     )  # fmt: skip
 
 
@@ -289,20 +294,20 @@ def composite_rows_bwd_kernel(
     tile_end: wp.array[wp.int32],  # [T]
     items: wp.array[wp.int32],  # [M]
     item_splat: wp.array[wp.int32],  # [M]
-    background: wp.array[wp.float32],  # [3]
+    background: wp.array2d[wp.float32],  # [B, 3]
     n_columns: int,
     alpha_threshold: wp.float32,
     cap: wp.float32,
-    final_T: wp.array2d[wp.float32],  # [H, W]
-    last: wp.array2d[wp.int32],  # [H, W]
-    v_image: wp.array3d[wp.float32],  # [3, H, W]
-    v_coverage: wp.array2d[wp.float32],  # [H, W]
-    v_depths: wp.array2d[wp.float32],  # [H, W]
+    final_T: wp.array3d[wp.float32],  # [B, H, W]
+    last: wp.array3d[wp.int32],  # [B, H, W]
+    v_image: wp.array4d[wp.float32],  # [B, 3, H, W]
+    v_coverage: wp.array3d[wp.float32],  # [B, H, W]
+    v_depths: wp.array3d[wp.float32],  # [B, H, W]
     # Out:
     partials: wp.array2d[wp.float32],  # [M, 10]
 ):
     _composite_tile_bwd(
         first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        v_image.shape[2], v_image.shape[1], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
+        v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
         partials,
     )  # fmt: skip

@@ -74,6 +74,14 @@ def _limited(slope: wp.float64, focal: wp.float64, center: wp.float64, size: wp.
     return wp.clamp(slope, -(center + margin) / focal, (size - center + margin) / focal)
 
 
+@wp.func
+def view_of(view_ids: wp.array[wp.int32], n: int) -> int:
+    """View that Gaussian ``n`` belongs to; without ids there is only one."""
+    if view_ids.shape[0] == 0:
+        return 0
+    return view_ids[n]
+
+
 def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
@@ -111,8 +119,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         scales: wp.array[vec3],  # [N]
         opacities: wp.array[real],  # [N]
         colors: wp.array[vec3],  # [N]
-        viewmats: wp.array[mat44],  # [1]
-        Ks: wp.array[mat33],  # [1]
+        viewmats: wp.array[mat44],  # [B]
+        Ks: wp.array[mat33],  # [B]
+        view_ids: wp.array[wp.int32],  # [N] in 0..B-1, or empty where B = 1
         width: int,
         height: int,
         tile_width: int,
@@ -133,8 +142,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         keys[n] = wp.float32(0.0)
         zero, one, half = wp.float64(0.0), wp.float64(1.0), wp.float64(0.5)
         largest, tiny = wp.float64(LARGEST), wp.float64(1.0e-30)
-        view = rotation_part(viewmats[0])
-        p = view * wide3(means[n]) + translation_part(viewmats[0])
+        i_view = view_of(view_ids, n)
+        view = rotation_part(viewmats[i_view])
+        p = view * wide3(means[n]) + translation_part(viewmats[i_view])
         q = wide4(quats[n])
         norm = wp.length(q)
         opacity = wp.float64(opacities[n])
@@ -147,8 +157,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         if not (opacity >= alpha_threshold) or not (opacity < largest):
             return
         g = view * (_rotation_of(q / norm) * wp.diag(wide3(scales[n])))
-        focal_x, focal_y = wp.float64(Ks[0][0, 0]), wp.float64(Ks[0][1, 1])
-        center_x, center_y = wp.float64(Ks[0][0, 2]), wp.float64(Ks[0][1, 2])
+        focal_x, focal_y = wp.float64(Ks[i_view][0, 0]), wp.float64(Ks[i_view][1, 1])
+        center_x, center_y = wp.float64(Ks[i_view][0, 2]), wp.float64(Ks[i_view][1, 2])
         ux = _limited(p[0] / p[2], focal_x, center_x, wp.float64(width))
         uy = _limited(p[1] / p[2], focal_y, center_y, wp.float64(height))
         gx = (_row(g, 0) - ux * _row(g, 2)) * (focal_x / p[2])
@@ -210,8 +220,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         means: wp.array[vec3],  # [N]
         quats: wp.array[vec4],  # [N]
         scales: wp.array[vec3],  # [N]
-        viewmats: wp.array[mat44],  # [1]
-        Ks: wp.array[mat33],  # [1]
+        viewmats: wp.array[mat44],  # [B]
+        Ks: wp.array[mat33],  # [B]
+        view_ids: wp.array[wp.int32],  # [N] in 0..B-1, or empty where B = 1
         width: int,
         height: int,
         low_pass: wp.float64,
@@ -235,21 +246,22 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         for k in range(count):
             for c in range(10):
                 v[c] += wp.float64(partials[first_item[n] + k, c])
-        view = rotation_part(viewmats[0])
+        i_view = view_of(view_ids, n)
+        view = rotation_part(viewmats[i_view])
         mean = wide3(means[n])
-        p = view * mean + translation_part(viewmats[0])
+        p = view * mean + translation_part(viewmats[i_view])
         q = wide4(quats[n])
         unit = q / wp.length(q)
         rot = _rotation_of(unit)
         scale = wide3(scales[n])
         m = rot * wp.diag(scale)
         g = view * m
-        focal_x, focal_y = wp.float64(Ks[0][0, 0]), wp.float64(Ks[0][1, 1])
+        focal_x, focal_y = wp.float64(Ks[i_view][0, 0]), wp.float64(Ks[i_view][1, 1])
         rz = wp.float64(1.0) / p[2]
         fx, fy = focal_x * rz, focal_y * rz
         sx, sy = p[0] / p[2], p[1] / p[2]
-        ux = _limited(sx, focal_x, wp.float64(Ks[0][0, 2]), wp.float64(width))
-        uy = _limited(sy, focal_y, wp.float64(Ks[0][1, 2]), wp.float64(height))
+        ux = _limited(sx, focal_x, wp.float64(Ks[i_view][0, 2]), wp.float64(width))
+        uy = _limited(sy, focal_y, wp.float64(Ks[i_view][1, 2]), wp.float64(height))
         gx = (_row(g, 0) - ux * _row(g, 2)) * fx
         gy = (_row(g, 1) - uy * _row(g, 2)) * fy
         var_y = wp.dot(gy, gy) + low_pass

@@ -9,6 +9,7 @@ import warp as wp
 from torch import Tensor
 
 from mgavatar.kernels import bridge
+from mgavatar.kernels.projection import view_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,7 +24,9 @@ def _emit_kernel(
     offsets: wp.array[wp.int32],  # [N] entries before each Gaussian, in depth order
     first_item: wp.array[wp.int32],  # [N]
     tiles: wp.array2d[wp.int32],  # [N, 4]
+    view_ids: wp.array[wp.int32],  # [N], or empty where there is one view
     n_columns: int,
+    tiles_per_view: int,
     # Out:
     entry_tile: wp.array[wp.int32],  # [M] by depth
     entry_item: wp.array[wp.int32],  # [M] by depth
@@ -33,9 +36,10 @@ def _emit_kernel(
     n = order[i]
     entry = offsets[i]
     item = first_item[n]
+    first_tile = tiles_per_view * view_of(view_ids, n)
     for row in range(tiles[n, 2], tiles[n, 3]):
         for column in range(tiles[n, 0], tiles[n, 1]):
-            entry_tile[entry] = row * n_columns + column
+            entry_tile[entry] = first_tile + row * n_columns + column
             entry_item[entry] = item
             item_splat[item] = n
             entry += 1
@@ -62,6 +66,8 @@ def _tile_bounds_kernel(
 class WorkLists:
     """For each tile, its splats from near to far; each (tile, splat) pair is an *item*.
 
+    The tiles of several views follow each other, view after view: T is their number in all views.
+
     Attributes:
         tile_begin: First entry of ``items`` of each tile, shape [T], int32.
         tile_end: One past the last, shape [T], int32.
@@ -79,20 +85,28 @@ class WorkLists:
     n_items: Tensor
 
 
-def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -> WorkLists:
+def build_work_lists(
+    keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int, *, view_ids: Tensor, n_views: int = 1
+) -> WorkLists:
     """Sort splats by depth once, ties by index, and hand them to the tiles that they touch.
+
+    One sort serves all views: the sort by tile is stable, so each tile of each view gets its own in depth order.
 
     Args:
         keys: Depth of each splat, shape [N], float32.
         tiles: First and last + 1 tile column, then row, of each splat, shape [N, 4], int32.
         n_columns: Tiles across the image.
         n_rows: Tiles down the image.
+        view_ids: View of each splat, shape [N], int32, or empty where there is one view.
+        n_views: Number of views.
 
     Raises:
         ValueError: If there would be more than 2^31 - 1 items.
     """
     n = len(keys)
     device = keys.device
+    tiles_per_view = n_columns * n_rows
+    n_tiles = n_views * tiles_per_view
     n_items = (tiles[:, 1] - tiles[:, 0]) * (tiles[:, 3] - tiles[:, 2])
     order = bridge.sort_pairs(keys, torch.arange(n, dtype=torch.int32, device=device))[1]
     in_order = n_items[order]
@@ -107,11 +121,12 @@ def build_work_lists(keys: Tensor, tiles: Tensor, n_columns: int, n_rows: int) -
     # Numbered splat after splat, so that a splat's partial gradients lie together.
     first_item = (torch.cumsum(n_items, 0, dtype=torch.int64) - n_items).int()
     entry_tile, items, item_splat = torch.empty(3, total, dtype=torch.int32, device=device)
-    bounds = torch.zeros(2, n_columns * n_rows, dtype=torch.int32, device=device)
+    bounds = torch.zeros(2, n_tiles, dtype=torch.int32, device=device)
     if total:
         emitted = [entry_tile, items, item_splat]
-        bridge.launch(_emit_kernel, n, [order, offsets, first_item, tiles, n_columns], emitted)
-        bits = max(1, (n_columns * n_rows - 1).bit_length())
+        inputs = [order, offsets, first_item, tiles, view_ids, n_columns, tiles_per_view]
+        bridge.launch(_emit_kernel, n, inputs, emitted)
+        bits = max(1, (n_tiles - 1).bit_length())
         entry_tile, items = bridge.sort_pairs(entry_tile, items, bits=bits)
         bridge.launch(_tile_bounds_kernel, total, [entry_tile], [bounds[0], bounds[1]])
     return WorkLists(bounds[0], bounds[1], items, item_splat, first_item, n_items)
