@@ -192,7 +192,7 @@ def test_arrays_that_lie(file, data, words):
         ([1, "two"], "something else than integers"),
         ([[1, 2], [3, 4]], "something else than integers"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )
 @pytest.mark.parametrize("protocol", [2, 5])
 def test_values_that_are_refused(file, value, words, protocol):
