@@ -155,7 +155,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             v_green = v_image[b, 1, y, x]
             v_blue = v_image[b, 2, y, x]
             v_depth = v_depths[b, y, x]
-            behind = v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_coverage[b, y, x]
+            behind = (
+                v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_coverage[b, y, x]
+            )
             accepted = last[b, y, x]
         # Every thread of the block walks the same entries: the block sums need all of them.
         for step in range(tile_end[tile] - tile_begin[tile]):

@@ -14,6 +14,31 @@ wp.set_module_options({"enable_backward": False})
 TILE_WIDTH = 128
 TILE_HEIGHT = 16
 
+_EXP2 = {
+    "polynomial": """
+        // 2^n 2^f with a degree 6 polynomial, relative error below 1e-7.
+        e = most(e, (vf)(-126.0f));
+        const vf n = __builtin_elementwise_roundeven(e);
+        const vf f = e - n;
+        vf p = (vf)(1.533757683e-4f);
+        p = fma(p, f, (vf)1.339986036e-3f);
+        p = fma(p, f, (vf)9.618519534e-3f);
+        p = fma(p, f, (vf)5.550328998e-2f);
+        p = fma(p, f, (vf)2.402264661e-1f);
+        p = fma(p, f, (vf)6.931472056e-1f);
+        p = fma(p, f, (vf)1.0f);
+        const vi bits = (__builtin_convertvector(n, vi) + 127) << 23;
+        vf scale;
+        __builtin_memcpy(&scale, &bits, sizeof(scale));
+        return p * scale;
+""",
+    "exact": """
+        vf p;
+        for (int i = 0; i < LANES; ++i) p[i] = __builtin_exp2f(e[i]);
+        return p;
+""",
+}
+
 _COMMON = """
     enum { LANES = 8, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES, SIZE = TH * STRIDE };
     typedef float vf __attribute__((ext_vector_type(LANES), aligned(4)));
@@ -30,24 +55,11 @@ _COMMON = """
     };
     auto least = [](vf a, vf b) -> vf { return __builtin_elementwise_min(a, b); };
     auto most = [](vf a, vf b) -> vf { return __builtin_elementwise_max(a, b); };
-    // 2^e for e <= 0: 2^n 2^f with a degree 6 polynomial, relative error below 1e-7.
+    // 2^e for e <= 0.
     auto exp2 = [fma, most](vf e) -> vf {
-        e = most(e, (vf)(-126.0f));
-        const vf n = __builtin_elementwise_roundeven(e);
-        const vf f = e - n;
-        vf p = (vf)(1.533757683e-4f);
-        p = fma(p, f, (vf)1.339986036e-3f);
-        p = fma(p, f, (vf)9.618519534e-3f);
-        p = fma(p, f, (vf)5.550328998e-2f);
-        p = fma(p, f, (vf)2.402264661e-1f);
-        p = fma(p, f, (vf)6.931472056e-1f);
-        p = fma(p, f, (vf)1.0f);
-        const vi bits = (__builtin_convertvector(n, vi) + 127) << 23;
-        vf scale;
-        __builtin_memcpy(&scale, &bits, sizeof(scale));
-        return p * scale;
+        EXP2
     };
-    const int per_view = n_columns * ((height + TH - 1) / TH), view = tile / per_view, local = tile %% per_view;
+    const int per_view = n_columns * ((height + TH - 1) / TH), local = tile %% per_view;
     const int x0 = (local %% n_columns) * TW, y0 = (local / n_columns) * TH;
     const int x1 = x0 + TW < width ? x0 + TW : width, y1 = y0 + TH < height ? y0 + TH : height;
     const int begin = tile_begin.data[tile], end = tile_end.data[tile];
@@ -127,20 +139,22 @@ _FORWARD = (
             }
         }
     }
+    const int view = tile / (n_columns * ((height + TH - 1) / TH));
     const float* back = &background.data[3 * view];
     const float b0 = back[0], b1 = back[1], b2 = back[2];
     const long long plane = (long long)width * height;
+    const long long start = view * plane;
+    float* pixels = &image.data[3 * start];
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0;
-            const long long o = view * plane + y * width + x, c = o + 2 * view * plane;
-            image.data[c] = red[i] + T[i] * b0;
-            image.data[c + plane] = green[i] + T[i] * b1;
-            image.data[c + 2 * plane] = blue[i] + T[i] * b2;
-            coverage.data[o] = 1.0f - T[i];
-            depths.data[o] = depth[i];
-            final_T.data[o] = T[i];
-            last.data[o] = accepted[i];
+            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
+            pixels[o] = red[i] + T[i] * b0;
+            pixels[plane + o] = green[i] + T[i] * b1;
+            pixels[2 * plane + o] = blue[i] + T[i] * b2;
+            coverage.data[start + o] = 1.0f - T[i];
+            depths.data[start + o] = depth[i];
+            final_T.data[start + o] = T[i];
+            last.data[start + o] = accepted[i];
         }
 #endif
 """
@@ -154,9 +168,12 @@ _BACKWARD = (
     + """
     float T[SIZE], v_red[SIZE], v_green[SIZE], v_blue[SIZE], v_depth[SIZE], behind[SIZE];
     int accepted[SIZE];
+    const int view = tile / (n_columns * ((height + TH - 1) / TH));
     const float* back = &background.data[3 * view];
     const float b0 = back[0], b1 = back[1], b2 = back[2];
     const long long plane = (long long)width * height;
+    const long long start = view * plane;
+    const float* v_pixels = &v_image.data[3 * start];
     int furthest = -1;
     for (int i = 0; i < SIZE; ++i) {
         T[i] = v_red[i] = v_green[i] = v_blue[i] = v_depth[i] = behind[i] = 0.0f;
@@ -164,15 +181,14 @@ _BACKWARD = (
     }
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0;
-            const long long o = view * plane + y * width + x, c = o + 2 * view * plane;
-            T[i] = final_T.data[o];
-            v_red[i] = v_image.data[c];
-            v_green[i] = v_image.data[c + plane];
-            v_blue[i] = v_image.data[c + 2 * plane];
-            v_depth[i] = v_depths.data[o];
-            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_coverage.data[o];
-            accepted[i] = last.data[o];
+            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
+            T[i] = final_T.data[start + o];
+            v_red[i] = v_pixels[o];
+            v_green[i] = v_pixels[plane + o];
+            v_blue[i] = v_pixels[2 * plane + o];
+            v_depth[i] = v_depths.data[start + o];
+            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_coverage.data[start + o];
+            accepted[i] = last.data[start + o];
             furthest = accepted[i] > furthest ? accepted[i] : furthest;
         }
     auto sum = [](vf v) -> float {
@@ -238,76 +254,82 @@ _BACKWARD = (
 )
 
 
-@wp.func_native(_FORWARD)
-def _composite_tile(
-    tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
-    width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
-    image: wp.array4d[wp.float32], coverage: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
-    final_T: wp.array3d[wp.float32], last: wp.array3d[wp.int32],
-): ...  # fmt: skip
+def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
+    module = f"{__name__}_{exp}"
+
+    @wp.func_native(_FORWARD.replace("EXP2", _EXP2[exp]))
+    def composite_tile(
+        tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
+        items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
+        width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
+        image: wp.array4d[wp.float32], coverage: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
+        final_T: wp.array3d[wp.float32], last: wp.array3d[wp.int32],
+    ): ...  # fmt: skip
+
+    @wp.func_native(_BACKWARD.replace("EXP2", _EXP2[exp]))
+    def composite_tile_bwd(
+        tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
+        items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
+        width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array3d[wp.float32],
+        last: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32], v_coverage: wp.array3d[wp.float32],
+        v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
+    ): ...  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False)
+    def composite_rows_kernel(
+        # In:
+        first: int,
+        splats: wp.array2d[wp.float32],  # [N, 16] projection.SPLAT
+        tile_begin: wp.array[wp.int32],  # [T]
+        tile_end: wp.array[wp.int32],  # [T]
+        items: wp.array[wp.int32],  # [M]
+        item_splat: wp.array[wp.int32],  # [M]
+        background: wp.array2d[wp.float32],  # [B, 3]
+        n_columns: int,
+        alpha_threshold: wp.float32,
+        stop: wp.float32,
+        cap: wp.float32,
+        # Out:
+        image: wp.array4d[wp.float32],  # [B, 3, H, W]
+        coverage: wp.array3d[wp.float32],  # [B, H, W]
+        depths: wp.array3d[wp.float32],  # [B, H, W] sum of weight times depth
+        final_T: wp.array3d[wp.float32],  # [B, H, W]
+        last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
+    ):
+        composite_tile(
+            first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
+            image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
+        )  # fmt: skip
+
+    @wp.kernel(module=module, enable_backward=False)
+    def composite_rows_bwd_kernel(
+        # In:
+        first: int,
+        splats: wp.array2d[wp.float32],  # [N, 16]
+        tile_begin: wp.array[wp.int32],  # [T]
+        tile_end: wp.array[wp.int32],  # [T]
+        items: wp.array[wp.int32],  # [M]
+        item_splat: wp.array[wp.int32],  # [M]
+        background: wp.array2d[wp.float32],  # [B, 3]
+        n_columns: int,
+        alpha_threshold: wp.float32,
+        cap: wp.float32,
+        final_T: wp.array3d[wp.float32],  # [B, H, W]
+        last: wp.array3d[wp.int32],  # [B, H, W]
+        v_image: wp.array4d[wp.float32],  # [B, 3, H, W]
+        v_coverage: wp.array3d[wp.float32],  # [B, H, W]
+        v_depths: wp.array3d[wp.float32],  # [B, H, W]
+        # Out:
+        partials: wp.array2d[wp.float32],  # [M, 10]
+    ):
+        composite_tile_bwd(
+            first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
+            v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
+            partials,
+        )  # fmt: skip
+
+    return composite_rows_kernel, composite_rows_bwd_kernel
 
 
-@wp.func_native(_BACKWARD)
-def _composite_tile_bwd(
-    tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-    items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
-    width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array3d[wp.float32],
-    last: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32], v_coverage: wp.array3d[wp.float32],
-    v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
-): ...  # fmt: skip
-
-
-@wp.kernel
-def composite_rows_kernel(
-    # In:
-    first: int,
-    splats: wp.array2d[wp.float32],  # [N, 16] projection.SPLAT
-    tile_begin: wp.array[wp.int32],  # [T]
-    tile_end: wp.array[wp.int32],  # [T]
-    items: wp.array[wp.int32],  # [M]
-    item_splat: wp.array[wp.int32],  # [M]
-    background: wp.array2d[wp.float32],  # [B, 3]
-    n_columns: int,
-    alpha_threshold: wp.float32,
-    stop: wp.float32,
-    cap: wp.float32,
-    # Out:
-    image: wp.array4d[wp.float32],  # [B, 3, H, W]
-    coverage: wp.array3d[wp.float32],  # [B, H, W]
-    depths: wp.array3d[wp.float32],  # [B, H, W] sum of weight times depth
-    final_T: wp.array3d[wp.float32],  # [B, H, W]
-    last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
-):
-    _composite_tile(
-        first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
-    )  # fmt: skip
-
-
-@wp.kernel
-def composite_rows_bwd_kernel(
-    # In:
-    first: int,
-    splats: wp.array2d[wp.float32],  # [N, 16]
-    tile_begin: wp.array[wp.int32],  # [T]
-    tile_end: wp.array[wp.int32],  # [T]
-    items: wp.array[wp.int32],  # [M]
-    item_splat: wp.array[wp.int32],  # [M]
-    background: wp.array2d[wp.float32],  # [B, 3]
-    n_columns: int,
-    alpha_threshold: wp.float32,
-    cap: wp.float32,
-    final_T: wp.array3d[wp.float32],  # [B, H, W]
-    last: wp.array3d[wp.int32],  # [B, H, W]
-    v_image: wp.array4d[wp.float32],  # [B, 3, H, W]
-    v_coverage: wp.array3d[wp.float32],  # [B, H, W]
-    v_depths: wp.array3d[wp.float32],  # [B, H, W]
-    # Out:
-    partials: wp.array2d[wp.float32],  # [M, 10]
-):
-    _composite_tile_bwd(
-        first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-        v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
-        partials,
-    )  # fmt: skip
+KERNELS = {exp: _kernels(exp) for exp in _EXP2}
+"""(composite, its adjoint) by the exponential function."""

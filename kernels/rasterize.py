@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mgavatar.kernels import bridge, compositing, compositing_rows, projection
-from mgavatar.kernels.tiling import WorkLists, build_work_lists
+from mgavatar.kernels.tiling import MAX_ITEMS, WorkLists, build_work_lists
 
 Form = Literal["auto", "plain", "rows"]
 
@@ -23,7 +23,7 @@ LARGEST_CAP = 1.0 - 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class RasterSettings:
-    """What the rasterizer leaves out, and where; ``docs/numerics.md`` has the price of each."""
+    """What the rasterizer leaves out, and where; ``docs/tradeoffs.md`` has the price of each."""
 
     alpha_threshold: float = 1.0 / 255.0
     """Contributions below this alpha are skipped; 0 blends every Gaussian with every pixel."""
@@ -37,16 +37,18 @@ class RasterSettings:
     """Gaussians nearer than this are not drawn [m]."""
     form: Form = "auto"
     """``plain`` is one thread a pixel, on any device and dtype; ``rows`` is the CPU's vector form in float32."""
+    exp: Literal["polynomial", "exact"] = "polynomial"
+    """How the rows raise to a power: a polynomial of degree 6 in vectors, or the C library one by one."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What one camera sees.
+    """What one camera sees, or several.
 
     Attributes:
-        image: Composited colours, shape [3, H, W].
-        alpha: Coverage, shape [H, W].
-        depth: Sum of blending weight times depth [m], not divided by alpha, shape [H, W].
+        image: Composited colours, shape [3, H, W], of several views [B, 3, H, W].
+        alpha: Coverage, shape [H, W] or [B, H, W].
+        depth: Sum of blending weight times depth [m], not divided by alpha, shape [H, W] or [B, H, W].
         visible: Which Gaussians touch the image, shape [N], bool.
     """
 
@@ -60,7 +62,12 @@ _NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "ba
 
 
 def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, settings: RasterSettings) -> None:
-    shapes: tuple[tuple[int, ...], ...] = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), (4, 4), (3, 3), (3,))
+    views = tuple(tensors[5].shape[:-2])
+    if views == (0,):
+        raise ValueError(f"viewmat has shape {tuple(tensors[5].shape)}, needs at least one view")
+    views = views if len(views) == 1 else ()
+    camera: tuple[tuple[int, ...], ...] = ((*views, 4, 4), (*views, 3, 3), (*views, 3))
+    shapes: tuple[tuple[int, ...], ...] = ((n, 3), (n, 4), (n, 3), (n,), (n, 3), *camera)
     for name, tensor, shape in zip(_NAMES, tensors, shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}, needs {shape}")
@@ -78,9 +85,28 @@ def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, setting
         raise ValueError(f"near must be positive, got {settings.near}")
     if not settings.low_pass >= 0.0:
         raise ValueError(f"low_pass must be at least 0, got {settings.low_pass}")
+    if settings.exp not in compositing_rows.KERNELS:
+        raise ValueError(f"exp must be one of {', '.join(compositing_rows.KERNELS)}, got {settings.exp}")
     for name in ("alpha_threshold", "stop"):
         if not 0.0 <= getattr(settings, name) < 1.0:
             raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(settings, name)}")
+
+
+def _check_views(view_ids: Tensor | None, means: Tensor, viewmat: Tensor) -> None:
+    if viewmat.ndim == 2:
+        if view_ids is not None:
+            raise ValueError(f"view_ids needs several views, but viewmat has shape {tuple(viewmat.shape)}")
+        return
+    if view_ids is None:
+        raise ValueError(f"viewmat has shape {tuple(viewmat.shape)}, so view_ids has to say each Gaussian's view")
+    if tuple(view_ids.shape) != (len(means),):
+        raise ValueError(f"view_ids has shape {tuple(view_ids.shape)}, needs {(len(means),)}")
+    if view_ids.dtype != torch.int32 or view_ids.device != means.device:
+        raise ValueError(f"view_ids is {view_ids.dtype} on {view_ids.device}, needs torch.int32 on {means.device}")
+    if len(means):
+        low, high = torch.stack(view_ids.aminmax()).tolist()
+        if low < 0 or high >= len(viewmat):
+            raise ValueError(f"view_ids lie in {low}..{high}, need 0..{len(viewmat) - 1}")
 
 
 def _check_screen_grads(screen_grads: Tensor, means: Tensor) -> None:
@@ -109,6 +135,8 @@ class Work:
         form: ``plain`` or ``rows``.
         n_columns: Tiles across the image.
         size: Image width and height [px].
+        view_ids: View of each Gaussian, shape [N], int32; empty where there is one view.
+        n_views: Number of views.
     """
 
     splats: Tensor
@@ -116,11 +144,18 @@ class Work:
     form: Form
     n_columns: int
     size: tuple[int, int]
+    view_ids: Tensor
+    n_views: int = 1
 
     @property
     def n_tiles(self) -> int:
-        """Tiles of the image."""
+        """Tiles of all views' images."""
         return len(self.lists.tile_begin)
+
+    @property
+    def tiles_per_view(self) -> int:
+        """Tiles of one view's image."""
+        return self.n_tiles // self.n_views
 
     @property
     def inputs(self) -> list[Any]:
@@ -129,7 +164,9 @@ class Work:
         return [self.splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat]
 
 
-def project(settings: RasterSettings, size: tuple[int, int], tensors: tuple[Tensor, ...]) -> Work:
+def project(
+    settings: RasterSettings, size: tuple[int, int], tensors: tuple[Tensor, ...], view_ids: Tensor | None = None
+) -> Work:
     """Find each Gaussian's footprint and list the tiles' work; ``tensors`` are checked and in the order of the op."""
     *gaussians, viewmat, K, _ = tensors
     means = gaussians[0]
@@ -138,28 +175,44 @@ def project(settings: RasterSettings, size: tuple[int, int], tensors: tuple[Tens
     tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
     n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
     n = len(means)
+    n_views = len(viewmat) if viewmat.ndim == 3 else 1
+    view_ids = torch.empty(0, dtype=torch.int32, device=means.device) if view_ids is None else view_ids
     splats = means.new_empty(n, 16)
     tiles = torch.empty(n, 4, dtype=torch.int32, device=means.device)
     keys = torch.empty(n, dtype=torch.float32, device=means.device)
     if n:
-        inputs = [*gaussians, viewmat[None], K[None], width, height, *tile]
+        inputs = [*gaussians, viewmat.view(-1, 4, 4), K.view(-1, 3, 3), view_ids, width, height, *tile]
         inputs += [settings.near, settings.low_pass, settings.alpha_threshold]
         bridge.launch_ranges(projection.KERNELS[means.dtype][0], n, inputs, [splats, tiles, keys])
-    return Work(splats, build_work_lists(keys, tiles, n_columns, n_rows), form, n_columns, size)
+    lists = build_work_lists(keys, tiles, n_columns, n_rows, view_ids=view_ids, n_views=n_views)
+    return Work(splats, lists, form, n_columns, size, view_ids, n_views)
+
+
+def _by_view(background: Tensor, *tensors: Tensor) -> list[Tensor]:
+    """``tensors`` with the view as the first axis, as the kernels take them; one view's, as the op does, have none."""
+    return list(tensors) if background.ndim == 2 else [tensor[None] for tensor in tensors]
 
 
 def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tensor]:
-    """Composite: image [3, H, W], coverage, depth, final T [H, W] and the last entry that each pixel accepted."""
+    """Composite: image [3, H, W], coverage, depth, final T [H, W] and the last entry that each pixel accepted.
+
+    With a background of several views, [B, 3], all outputs have B as their first axis.
+    """
     width, height = work.size
-    image = background.new_empty(3, height, width)
-    planes = [background.new_empty(height, width) for _ in range(3)]
-    outputs = [image, *planes, torch.empty(height, width, dtype=torch.int32, device=background.device)]
+    if work.n_views * width * height > MAX_ITEMS:
+        raise ValueError(f"{work.n_views} x {width} x {height} pixels are more than {MAX_ITEMS}: lower the image size")
+    plane = (*background.shape[:-1], height, width)
+    image = background.new_empty(*background.shape, height, width)
+    planes = [background.new_empty(plane) for _ in range(3)]
+    outputs = [image, *planes, torch.empty(plane, dtype=torch.int32, device=background.device)]
     knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
-    inputs = [*work.inputs, background, work.n_columns, *knobs]
+    inputs = [*work.inputs, *_by_view(background, background), work.n_columns]
+    written = _by_view(background, *outputs)
     if work.form == "rows":
-        bridge.launch_ranges(compositing_rows.composite_rows_kernel, work.n_tiles, inputs, outputs)
+        bridge.launch_ranges(compositing_rows.KERNELS[settings.exp][0], work.n_tiles, [*inputs, *knobs], written)
     else:
-        bridge.launch(compositing.KERNELS[background.dtype][0], work.n_tiles * compositing.BLOCK, inputs, outputs)
+        inputs += [work.tiles_per_view, *knobs]
+        bridge.launch(compositing.KERNELS[background.dtype][0], work.n_tiles * compositing.BLOCK, inputs, written)
     return outputs
 
 
@@ -170,25 +223,49 @@ def blend_backward(
     rows = work.form == "rows"
     # The rows write every item; the plain form on a CPU adds up threads that run one after the other.
     partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.items), 10)
-    inputs = [*work.inputs, background, work.n_columns, settings.alpha_threshold, settings.alpha_cap, final_T, last]
-    inputs += v_planes
+    inputs = [*work.inputs, *_by_view(background, background), work.n_columns]
+    rest = [settings.alpha_threshold, settings.alpha_cap, *_by_view(background, final_T, last, *v_planes)]
     if rows:
-        bridge.launch_ranges(compositing_rows.composite_rows_bwd_kernel, work.n_tiles, inputs, [partials])
+        bridge.launch_ranges(compositing_rows.KERNELS[settings.exp][1], work.n_tiles, [*inputs, *rest], [partials])
     else:
+        inputs += [work.tiles_per_view, *rest]
         kernel = compositing.KERNELS[background.dtype][1]
         bridge.launch(kernel, work.n_tiles * compositing.BLOCK, inputs, [partials])
     return partials
 
 
+def _camera_gradient(shares: Tensor, view_ids: Tensor, viewmat: Tensor) -> Tensor:
+    """Sum of the Gaussians' shares [N, 12] in each view, in the order in which one view alone adds them."""
+    v_viewmat = torch.zeros_like(viewmat)
+    if viewmat.ndim == 2:
+        v_viewmat[:3] = shares.sum(0).reshape(3, 4)
+        return v_viewmat
+    for b in range(len(viewmat)):
+        v_viewmat[b, :3] = shares[view_ids == b].sum(0).reshape(3, 4)
+    return v_viewmat
+
+
+def _background_gradient(v_image: Tensor, final_T: Tensor) -> Tensor:
+    """What each view's background gets; a sum a view, so that torch adds a view's pixels as if it were alone."""
+    if v_image.ndim == 3:
+        return (v_image * final_T).sum((1, 2))
+    return torch.stack([(v * T).sum((1, 2)) for v, T in zip(v_image, final_T, strict=True)])
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, settings: RasterSettings, size: tuple[int, int], screen_grads: Tensor | None, *tensors: Tensor
+        ctx: Any,
+        settings: RasterSettings,
+        size: tuple[int, int],
+        screen_grads: Tensor | None,
+        view_ids: Tensor | None,
+        *tensors: Tensor,
     ) -> tuple[Tensor, ...]:
         tensors = tuple(tensor.contiguous() for tensor in tensors)
-        work = project(settings, size, tensors)
+        work = project(settings, size, tensors, view_ids)
         image, coverage, depth, final_T, last = blend(settings, work, tensors[-1])
-        ctx.save_for_backward(*tensors, final_T, last)
+        ctx.save_for_backward(*tensors, work.view_ids, final_T, last)
         ctx.work, ctx.settings, ctx.screen_grads = work, settings, screen_grads
         visible = work.lists.n_items > 0
         ctx.mark_non_differentiable(visible)
@@ -197,7 +274,7 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_image: Tensor, v_coverage: Tensor, v_depth: Tensor, _: Tensor) -> Any:
-        *tensors, final_T, last = ctx.saved_tensors
+        *tensors, _, final_T, last = ctx.saved_tensors  # torch raises here if one was changed in place
         means, quats, scales, _, _, viewmat, K, background = tensors
         work: Work = ctx.work
         settings: RasterSettings = ctx.settings
@@ -206,20 +283,17 @@ class _Rasterize(torch.autograd.Function):
         grads = [torch.zeros_like(tensor) for tensor in tensors[:5]]
         means2d = ctx.screen_grads if ctx.screen_grads is not None else means.new_empty(len(means), 2)
         means2d.zero_()
-        wants_camera = ctx.needs_input_grad[8]
+        wants_camera = ctx.needs_input_grad[9]
         # In double precision: the camera's gradient is a sum over all Gaussians, which mostly cancels.
         v_views = torch.zeros(len(means) if wants_camera else 0, 12, dtype=torch.float64, device=means.device)
         if len(means):
-            inputs = [means, quats, scales, viewmat[None], K[None], *work.size, settings.low_pass]
-            inputs += [work.lists.first_item, work.lists.n_items, partials]
+            inputs = [means, quats, scales, viewmat.view(-1, 4, 4), K.view(-1, 3, 3), work.view_ids, *work.size]
+            inputs += [settings.low_pass, work.lists.first_item, work.lists.n_items, partials]
             kernel = projection.KERNELS[means.dtype][1]
             bridge.launch_ranges(kernel, len(means), inputs, [*grads, means2d, v_views])
-        v_viewmat = None
-        if wants_camera:
-            v_viewmat = torch.zeros_like(viewmat)
-            v_viewmat[:3] = v_views.sum(0).reshape(3, 4)
-        v_background = (v_image * final_T).sum((1, 2)) if ctx.needs_input_grad[10] else None
-        return None, None, None, *grads, v_viewmat, None, v_background
+        v_viewmat = _camera_gradient(v_views, work.view_ids, viewmat) if wants_camera else None
+        v_background = _background_gradient(v_planes[0], final_T) if ctx.needs_input_grad[11] else None
+        return None, None, None, None, *grads, v_viewmat, None, v_background
 
 
 def rasterize(
@@ -235,11 +309,15 @@ def rasterize(
     background: Tensor | None = None,
     settings: RasterSettings | None = None,
     screen_grads: Tensor | None = None,
+    view_ids: Tensor | None = None,
 ) -> Rendering:
-    """Draw Gaussians as a camera sees them (EWA splatting, front to back).
+    """Draw Gaussians as a camera sees them (EWA splatting, front to back), or several cameras in one launch.
 
     Differentiable in the Gaussians, ``viewmat`` and ``background``; deterministic on every device and for any number
     of threads. A Gaussian with a NaN, an infinity or a zero quaternion is not drawn and gets a zero gradient.
+
+    With B views, each Gaussian belongs to one of them; a view's image and gradients are, bit for bit, what its
+    Gaussians give alone. Gaussians that several views see are repeated by the caller.
 
     Args:
         means: Centres in world space [m], shape [N, 3], float32 or float64.
@@ -247,23 +325,29 @@ def rasterize(
         scales: Standard deviations along the rotated axes [m], shape [N, 3].
         opacities: In 0..1, shape [N].
         colors: RGB, shape [N, 3].
-        viewmat: World to camera, OpenCV axes, shape [4, 4].
-        K: Intrinsics [px], shape [3, 3].
+        viewmat: World to camera, OpenCV axes, shape [4, 4], or [B, 4, 4] for several views.
+        K: Intrinsics [px], shape [3, 3], or [B, 3, 3]; one may serve several views.
         size: Image width and height [px].
-        background: RGB behind everything, black by default, shape [3].
+        background: RGB behind everything, black by default, shape [3], or [B, 3]; one may serve several views.
         settings: Truncations and form.
         screen_grads: Filled by the backward pass with the gradient of the image-space means [1/px], shape [N, 2].
+        view_ids: View of each Gaussian where there are several, shape [N], int32.
 
     Returns:
-        Image, coverage, depth and visibility.
+        Image, coverage, depth and visibility; the first three by view where there are several.
 
     Raises:
-        ValueError: If shapes, dtypes, devices or settings do not fit, or the work exceeds 2^31 - 1 items.
+        ValueError: If shapes, dtypes, devices or settings do not fit, ``view_ids`` name a view that is not there, or
+            the work exceeds 2^31 - 1 items or pixels.
     """
     settings = settings or RasterSettings()
-    background = means.new_zeros(3) if background is None else background
+    background = means.new_zeros(*viewmat.shape[:-2], 3) if background is None else background
+    if viewmat.ndim == 3:
+        K = K.expand(len(viewmat), 3, 3) if K.shape == (3, 3) else K
+        background = background.expand(len(viewmat), 3) if background.shape == (3,) else background
     tensors = (means, quats, scales, opacities, colors, viewmat, K, background)
     _check(len(means), tensors, *size, settings)
+    _check_views(view_ids, means, viewmat)
     if screen_grads is not None:
         _check_screen_grads(screen_grads, means)
-    return Rendering(*_Rasterize.apply(settings, size, screen_grads, *tensors))
+    return Rendering(*_Rasterize.apply(settings, size, screen_grads, view_ids, *tensors))

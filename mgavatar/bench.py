@@ -51,7 +51,8 @@ class Row:
 
 
 @contextmanager
-def _threads(n: int) -> Iterator[None]:
+def thread_limit(n: int) -> Iterator[None]:
+    """Let kernels and torch use ``n`` CPU threads for a while."""
     before = bridge.num_threads(), torch.get_num_threads()
     bridge.set_num_threads(n)
     torch.set_num_threads(n)
@@ -153,7 +154,8 @@ def _exponents(device: torch.device) -> dict[str, float]:
     }
 
 
-def _device_name(device: torch.device) -> str:
+def device_name(device: torch.device) -> str:
+    """Model of the GPU, or of the processor with its number of cores."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     model = platform.processor() or platform.machine()
@@ -166,7 +168,7 @@ def _device_name(device: torch.device) -> str:
     return f"{model}, {os.cpu_count()} cores"
 
 
-def _commit() -> str | None:
+def commit_of_checkout() -> str | None:
     """The commit that runs, where the program runs from a checkout with git."""
     folder = Path(__file__).resolve().parent.parent
     if not (folder / ".git").exists():
@@ -211,33 +213,37 @@ def _blending_share(n: int, size: tuple[int, int], device: torch.device) -> floa
     return median(shares[2:])
 
 
-def bench_kernels(*, threads: int | None = None, json_path: Path | None = None, device: str = "cpu") -> str:
+def bench_kernels(
+    *, threads: int | None = None, json_path: Path | None = None, device: str = "cpu", avatar: Path | None = None
+) -> str:
     """Time every kernel, its plain form and the machine itself.
 
     Args:
         threads: CPU threads for kernels and torch; all of the machine's by default.
         json_path: Where to write the rows as JSON.
         device: ``cpu`` or ``cuda``.
+        avatar: A fitted avatar, ``avatar.pt``, to be timed as well.
 
     Returns:
         A table for people.
 
     Raises:
+        DataError: If ``avatar`` cannot be read.
         ValueError: If ``threads`` is not positive.
     """
     where = torch.device(device)
     n = bridge.num_threads() if threads is None else threads
     rows: list[Row] = []
-    with _threads(n):
+    with thread_limit(n):
         machine = calibrate(where)
-        rows.extend(_row(job, machine, n, where) for job in jobs(where))
+        rows.extend(_row(job, machine, n, where) for job in jobs(where, avatar))
         exponents = _exponents(where)
         share = _blending_share(20_000, (512, 512), where)
-    name = _device_name(where)
+    name = device_name(where)
     if json_path is not None:
         report: dict[str, Any] = {
             "device": name,
-            "commit": _commit(),
+            "commit": commit_of_checkout(),
             "operations_per_s": machine.operations,
             "bytes_per_s": machine.bytes,
             "exponents": exponents,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import median
@@ -14,9 +14,9 @@ from torch.nn import functional
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.avatar import Avatar
-from mgavatar.bench_trade_work import BALANCED, GRADIENTS, Row, Scene, psnr, run_step
+from mgavatar.bench_trade_work import BALANCED, Row, Scene, psnr
 from mgavatar.config import ColorNetConfig
-from mgavatar.kernels.rasterize import rasterize
+from mgavatar.kernels.rasterize import Rendering, rasterize
 from mgavatar.kernels.ssim import compare_images
 
 _C1, _C2, _SIGMA = 0.01**2, 0.03**2, 1.5
@@ -59,7 +59,7 @@ def _ssim_step(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, targ
     return float(value.detach()), leaf.grad
 
 
-def _interleaved(steps: dict[str, Callable[[], object]], rounds: int) -> dict[str, tuple[float, float]]:
+def _interleaved(steps: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, tuple[float, float]]:
     """Median milliseconds, and median ratio to the first, of steps that take turns."""
     times: dict[str, list[float]] = {name: [] for name in steps}
     for step in steps.values():
@@ -78,8 +78,7 @@ def _interleaved(steps: dict[str, Callable[[], object]], rounds: int) -> dict[st
 
 def ssim_rows(scene: Scene, *, rounds: int) -> list[Row]:
     """The SSIM term between an avatar's image and the capture: window in plain torch, scale in the kernel."""
-    g = dict(zip(GRADIENTS, scene.gaussians, strict=True))
-    image = run_image(scene, g).clamp(0.0, 1.0)
+    image = _drawn(scene).image.clamp(0.0, 1.0)
     value, exact = _ssim_step(partial(window_ssim, size=11), image.double(), scene.target.double())
     groups: dict[str, dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
         "SSIM window": {str(size): partial(window_ssim, size=size) for size in (11, 7)},
@@ -107,16 +106,12 @@ def ssim_rows(scene: Scene, *, rounds: int) -> list[Row]:
     return rows
 
 
-def run_image(scene: Scene, gaussians: dict[str, Tensor]) -> Tensor:
-    """The avatar as it is drawn by default, shape [3, H, W]."""
+def _drawn(scene: Scene) -> Rendering:
+    """What the avatar looks like by default."""
     camera = scene.camera
-    return rasterize(
-        **gaussians,
-        viewmat=torch.tensor(camera.viewmat, dtype=torch.float32),
-        K=torch.tensor(camera.K, dtype=torch.float32),
-        size=(camera.width, camera.height),
-        background=scene.background,
-    ).image
+    viewmat, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (camera.viewmat, camera.K))
+    size = (camera.width, camera.height)
+    return rasterize(*scene.gaussians, viewmat=viewmat, K=K, size=size, background=scene.background, settings=BALANCED)
 
 
 def canonical_positions(avatar: Avatar) -> Tensor:
@@ -134,13 +129,11 @@ def seen_colors(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor]:
     n = len(scenes[0].gaussians[0])
     total, count = torch.zeros(n, 3), torch.zeros(n)
     for scene in scenes:
-        camera = scene.camera
-        viewmat, K = (torch.tensor(m, dtype=torch.float32) for m in (camera.viewmat, camera.K))
-        size = (camera.width, camera.height)
-        drawn = rasterize(*scene.gaussians, viewmat=viewmat, K=K, size=size, settings=BALANCED)
+        drawn = _drawn(scene)
+        viewmat, K = (torch.tensor(m, dtype=torch.float32) for m in (scene.camera.viewmat, scene.camera.K))
         points = scene.gaussians[0] @ viewmat[:3, :3].T + viewmat[:3, 3]
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
-        grid = (2.0 * pixels / torch.tensor(size) - 1.0)[None, None]
+        grid = (2.0 * pixels / torch.tensor([scene.camera.width, scene.camera.height]) - 1.0)[None, None]
         maps = torch.cat([scene.target, drawn.depth[None], drawn.alpha[None]])[None]
         values = functional.grid_sample(maps, grid, align_corners=False)[0, :, 0].T
         covered = (grid[0, 0].abs() < 1.0).all(1) & (values[:, 4] > 0.9) & (points[:, 2] > 0.0)

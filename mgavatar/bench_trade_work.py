@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +25,8 @@ from mgavatar.capture.subject import Subject
 from mgavatar.config import ACCURACY
 from mgavatar.errors import DataError
 from mgavatar.evaluate import evaluation_pose
-from mgavatar.kernels.rasterize import RasterSettings, Work, blend, blend_backward, project, project_backward
+from mgavatar.kernels import rasterize as raster
+from mgavatar.kernels.rasterize import RasterSettings, Work, rasterize
 
 GRADIENTS = ("means", "quats", "scales", "opacities", "colors")
 """What a step differentiates, in the rasterizer's order."""
@@ -36,6 +39,9 @@ NEARLY_EXACT = RasterSettings(alpha_threshold=1e-8, stop=0.0)
 
 BALANCED = RasterSettings()
 """The other knobs stand here while one is timed."""
+
+SLOW_SIZE = 64
+"""Longer side of the image where a value would take minutes otherwise [px]."""
 
 PSNR_LIMIT = 300.0
 """Of equal images [dB]."""
@@ -113,7 +119,7 @@ class Setting:
         edit: Changes the splats between projection and blending, for what the kernels do not offer.
         image_scale: Of both sides of the image.
         default: Whether it is the program's.
-        slow: Run once, on the first view only.
+        slow: Run once, on the first view, which is reduced to ``SLOW_SIZE``.
         has_time: Whether the time means anything.
         note: For the table.
     """
@@ -154,6 +160,15 @@ def scenes_of(avatar: Avatar, subject: Subject, *, views: int, max_image_size: i
     return scenes
 
 
+def reduced(scene: Scene, max_image_size: int) -> Scene:
+    """A scene whose longer side has at most ``max_image_size`` pixels."""
+    camera = scene.camera
+    shrink = min(1.0, max_image_size / max(camera.width, camera.height))
+    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    target = torch.nn.functional.interpolate(scene.target[None], size=(height, width), mode="area")[0]
+    return replace(scene, camera=camera.scaled(width, height), target=target)
+
+
 def run_step(scene: Scene, settings: RasterSettings, setting: Setting | None = None) -> Step:
     """Draw a scene and differentiate it, with what ``setting`` says about types, splats and size."""
     dtype = torch.float64 if setting is None else setting.dtype
@@ -163,26 +178,43 @@ def run_step(scene: Scene, settings: RasterSettings, setting: Setting | None = N
     target = scene.target.to(dtype)
     if target.shape[1:] != size[::-1]:
         target = torch.nn.functional.interpolate(target[None], size=size[::-1], mode="area")[0]
-    placed = (torch.tensor(camera.viewmat, dtype=dtype), torch.tensor(camera.K, dtype=dtype))
-    tensors = (*(tensor.to(dtype) for tensor in (*scene.gaussians, *placed, scene.background)),)
-    start = time.perf_counter()
-    work = project(settings, size, tensors)
-    if setting is not None and setting.edit is not None:
-        setting.edit(work.splats)
-    image, coverage, depth, final_T, last = blend(settings, work, tensors[-1])
-    v_image = (image - target) * (2.0 / image.numel())
-    planes = [v_image, torch.zeros_like(coverage), torch.zeros_like(depth)]
-    partials = blend_backward(settings, work, tensors[-1], final_T, last, planes)
-    gradients = _to_gaussians(settings, work, tensors, partials)
-    return Step(image, gradients, time.perf_counter() - start)
+    leaves = [tensor.to(dtype, copy=True).requires_grad_() for tensor in scene.gaussians]
+    # Rounded like the rest: otherwise float64 would order Gaussians by the depths of another camera.
+    viewmat, K = (torch.tensor(matrix, dtype=torch.float32).to(dtype) for matrix in (camera.viewmat, camera.K))
+    background = scene.background.to(dtype)
+    with _edited_splats(setting.edit if setting is not None else None):
+        start = time.perf_counter()
+        drawn = rasterize(*leaves, viewmat=viewmat, K=K, size=size, background=background, settings=settings)
+        (drawn.image - target).square().mean().backward()
+        seconds = time.perf_counter() - start
+    return Step(drawn.image.detach(), tuple(_gradient(leaf) for leaf in leaves), seconds)
 
 
-def _to_gaussians(
-    settings: RasterSettings, work: Work, tensors: tuple[Tensor, ...], partials: Tensor
-) -> tuple[Tensor, ...]:
-    means2d = tensors[0].new_zeros(len(tensors[0]), 2)
-    no_camera = torch.zeros(0, 12, dtype=torch.float64)
-    return tuple(project_backward(settings, work, tensors, partials, means2d, no_camera))
+def _gradient(leaf: Tensor) -> Tensor:
+    return torch.zeros_like(leaf) if leaf.grad is None else leaf.grad
+
+
+@contextmanager
+def _edited_splats(edit: Callable[[Tensor], None] | None) -> Iterator[None]:
+    """Let ``edit`` change the splats between projection and blending, for what no setting of the op offers."""
+    project = raster.project
+
+    def edited(
+        settings: RasterSettings,
+        size: tuple[int, int],
+        tensors: tuple[Tensor, ...],
+        view_ids: Tensor | None = None,
+    ) -> Work:
+        work = project(settings, size, tensors, view_ids)
+        if edit is not None:
+            edit(work.splats)
+        return work
+
+    raster.project = edited
+    try:
+        yield
+    finally:
+        raster.project = project
 
 
 def psnr(image: Tensor, exact: Tensor) -> float:
@@ -218,7 +250,6 @@ def _level(name: str, thresholds: tuple[float, float]) -> Setting:
         timed=settings,
         scored=settings,
         default=settings == BALANCED,
-        slow=thresholds[0] == 0.0,
         note=f"alpha {fraction(thresholds[0])}, stop {fraction(thresholds[1])}",
     )
 
@@ -233,57 +264,45 @@ def fraction(value: float) -> str:
     return f"1/{1.0 / value:g}"
 
 
-def _settings_knob(knob: str, name: str, values: Sequence[float]) -> list[Setting]:
-    return [
-        Setting(
-            knob=knob,
-            value=fraction(value),
-            timed=replace(BALANCED, **{name: value}),
-            scored=replace(NEARLY_EXACT, **{name: value}),
-            default=value == getattr(BALANCED, name),
-            slow=name == "alpha_threshold" and value == 0.0,
-        )
-        for value in values
-    ]
+def _changed(knob: str, value: str, **changes: Any) -> Setting:
+    timed, scored = replace(BALANCED, **changes), replace(NEARLY_EXACT, **changes)
+    return Setting(knob=knob, value=value, timed=timed, scored=scored, default=timed == BALANCED)
+
+
+def _numbers(knob: str, name: str, values: Sequence[float]) -> list[Setting]:
+    return [_changed(knob, fraction(value), **{name: value}) for value in values]
+
+
+def _no_threshold() -> Setting:
+    none = replace(BALANCED, alpha_threshold=0.0, stop=0.0)
+    return Setting(knob="alpha threshold", value="0", timed=none, scored=none, slow=True, note="and no stop")
+
+
+def _emulated(knob: str, value: str, note: str, **changes: Any) -> Setting:
+    return replace(_changed(knob, value), default=False, note=note, **changes)
 
 
 def raster_knobs() -> list[list[Setting]]:
     """Every knob of the rasterizer with its values; each has one default, which its times are compared with."""
-    same = {"timed": BALANCED, "scored": NEARLY_EXACT}
-    exact_exp = {"timed": replace(BALANCED, exp="exact"), "scored": replace(NEARLY_EXACT, exp="exact")}
-    plain = {"timed": replace(BALANCED, form="plain"), "scored": replace(NEARLY_EXACT, form="plain")}
     rounded = "splats rounded between projection and blending; the kernels have no such form, so no time"
+    reduced_note = "image enlarged again; gradient of the reduced image's error"
     return [
         [_level(name, thresholds) for name, thresholds in ACCURACY.items()],
-        _settings_knob("alpha threshold", "alpha_threshold", (0.0, 1e-6, 1 / 1024, 1 / 255, 1 / 64)),
-        _settings_knob("stop", "stop", (0.0, 1e-4, 1e-3, 1e-2)),
-        _settings_knob("low-pass", "low_pass", (0.0, 0.1, 0.3)),
+        [_no_threshold(), *_numbers("alpha threshold", "alpha_threshold", (1e-8, 1e-6, 1 / 1024, 1 / 255, 1 / 64))],
+        _numbers("stop", "stop", (0.0, 1e-4, 1e-3, 1e-2)),
+        _numbers("low-pass", "low_pass", (0.0, 0.1, 0.3)),
         [
-            Setting(knob="extent", value="ellipse", default=True, **same),
-            Setting(
-                knob="extent", value="3 sigma", edit=_three_sigma, note="bounds set after the projection", **same
-            ),
+            _changed("extent", "ellipse"),
+            _emulated("extent", "3 sigma", "bounds set after the projection", edit=_three_sigma),
         ],
+        [_changed("exp", "polynomial"), _changed("exp", "exact", exp="exact")],
         [
-            Setting(knob="exp", value="polynomial", default=True, **same),
-            Setting(knob="exp", value="exact", **exact_exp),
+            replace(_changed("storage", "float64, plain form", form="plain"), dtype=torch.float64),
+            _changed("storage", "float32, plain form", form="plain"),
+            _changed("storage", "float32"),
+            _emulated("storage", "float16", rounded, edit=_half_precision, has_time=False),
         ],
-        [
-            Setting(knob="storage", value="float64, plain form", dtype=torch.float64, **plain),
-            Setting(knob="storage", value="float32, plain form", **plain),
-            Setting(knob="storage", value="float32", default=True, **same),
-            Setting(knob="storage", value="float16", edit=_half_precision, has_time=False, note=rounded, **same),
-        ],
-        [
-            Setting(knob="image scale", value="1", default=True, **same),
-            Setting(
-                knob="image scale",
-                value="1/2",
-                image_scale=0.5,
-                note="image enlarged again; gradient of the reduced image's error",
-                **same,
-            ),
-        ],
+        [_changed("image scale", "1"), _emulated("image scale", "1/2", reduced_note, image_scale=0.5)],
     ]
 
 
@@ -301,7 +320,7 @@ class Reference:
             self._steps[key] = run_step(self.scenes[view], replace(EXACT, low_pass=low_pass))
         return self._steps[key]
 
-    def remainder(self, side: int = 24) -> float:
+    def remainder(self, side: int = 16) -> float:
         """Largest change of a pixel without any threshold, in the middle of the first view, which is slow."""
         scene = self.scenes[0]
         camera = scene.camera
@@ -344,52 +363,62 @@ def _times(knob: Sequence[Setting], scenes: Sequence[Scene], rounds: int) -> dic
     """Median milliseconds and median ratio to the default, round by round: a slow moment meets all values."""
     quick = [setting for setting in knob if not setting.slow and setting.has_time]
     base = next(setting for setting in knob if setting.default)
-    seconds: dict[str, list[float]] = {setting.value: [] for setting in knob}
-    ratios: dict[str, list[float]] = {setting.value: [] for setting in knob}
-
-    def measure(scene: Scene, settings: Sequence[Setting]) -> None:
-        now = {setting.value: run_step(scene, setting.timed, setting).seconds for setting in settings}
-        for value, taken in now.items():
-            seconds[value].append(taken)
-            ratios[value].append(taken / now[base.value])
-
+    seconds: dict[str, list[float]] = {setting.value: [] for setting in quick}
+    ratios: dict[str, list[float]] = {setting.value: [] for setting in quick}
     for setting in quick:
         run_step(scenes[0], setting.timed, setting)  # compiles and warms up
     for _ in range(rounds):
         for scene in scenes:
-            measure(scene, quick)
-    for setting in knob:
-        if setting.slow:
-            measure(scenes[0], [base, setting])
-    return {value: (1e3 * median(taken), median(ratios[value])) for value, taken in seconds.items() if taken}
+            now = {setting.value: run_step(scene, setting.timed, setting).seconds for setting in quick}
+            for value, taken in now.items():
+                seconds[value].append(taken)
+                ratios[value].append(taken / now[base.value])
+    return {value: (1e3 * median(taken), median(ratios[value])) for value, taken in seconds.items()}
+
+
+def _row(
+    setting: Setting, score: _Score, *, ms: float | None = None, ratio: float | None = None, note: str = ""
+) -> Row:
+    return Row(
+        knob=setting.knob,
+        value=setting.value,
+        default=setting.default,
+        ms=ms,
+        ratio=ratio,
+        psnr=score.psnr,
+        worst=score.worst,
+        gradient=score.gradient,
+        note="; ".join(filter(None, (setting.note, note))),
+    )
+
+
+def _slow_row(setting: Setting, base: Setting, scene: Scene) -> Row:
+    small = reduced(scene, SLOW_SIZE)
+    usual = median(run_step(small, base.timed, base).seconds for _ in range(5))
+    step = run_step(small, setting.timed, setting)
+    score = _score([step], [run_step(small, replace(EXACT, low_pass=setting.scored.low_pass))])
+    size = f"{small.camera.width} x {small.camera.height}"
+    return _row(setting, score, ratio=step.seconds / usual, note=f"on one view at {size}")
 
 
 def measure_knob(knob: Sequence[Setting], reference: Reference, *, rounds: int) -> list[Row]:
     """Rows of one knob: times with everything else balanced, errors with everything else nearly exact."""
     times = _times(knob, reference.scenes, rounds)
+    base = next(setting for setting in knob if setting.default)
     rows = []
     for setting in knob:
-        low_pass = setting.scored.low_pass
-        few = setting.slow or low_pass != BALANCED.low_pass  # each costs an exact image of its own
-        views = range(1 if few else len(reference.scenes))
+        if setting.slow:
+            rows.append(_slow_row(setting, base, reference.scenes[0]))
+            continue
+        low_pass, usual = setting.scored.low_pass, BALANCED.low_pass
+        # Another low-pass has an exact image of its own, which takes its time.
+        views = range(len(reference.scenes) if low_pass == usual else 1)
         steps = [run_step(reference.scenes[view], setting.scored, setting) for view in views]
         score = _score(steps, [reference.step(view, low_pass) for view in views])
-        note = setting.note
-        if low_pass != BALANCED.low_pass:
-            other = psnr(reference.step(0, low_pass).image, reference.step(0, BALANCED.low_pass).image)
-            note = f"another picture: {other:.1f} dB from that of {BALANCED.low_pass:g}"
+        note = ""
+        if low_pass != usual:
+            other = psnr(reference.step(0, low_pass).image, reference.step(0, usual).image)
+            note = f"another picture: {other:.1f} dB from that of {usual:g}"
         ms, ratio = times.get(setting.value, (None, None))
-        rows.append(
-            Row(
-                knob=setting.knob,
-                value=setting.value,
-                default=setting.default,
-                ms=ms,
-                ratio=ratio,
-                psnr=score.psnr,
-                worst=score.worst,
-                gradient=score.gradient,
-                note=note,
-            )
-        )
+        rows.append(_row(setting, score, ms=ms, ratio=ratio, note=note))
     return rows

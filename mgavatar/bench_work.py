@@ -1,23 +1,26 @@
 """What ``mgavatar bench kernels`` times: each kernel on a stated amount of work, its plain form, and its floor.
 
-A plain form computes the same values the obvious way: one thread a pixel in 16 x 16 tiles for the rasterizer, torch or
-kornia for the rest.
+A plain form computes the same values the obvious way: one thread a pixel in 16 x 16 tiles for the rasterizer, a launch
+for each of several views, torch or kornia for the rest.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import kornia
 import torch
 from torch import Tensor
 
+from mgavatar.avatar import Avatar
 from mgavatar.kernels import binding, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
 from mgavatar.kernels.ssim import compare_images
+from mgavatar.render import mean_pose
 
 Step = Callable[[], Callable[[], object]]
 """Runs a forward pass and returns what runs its backward pass."""
@@ -74,8 +77,8 @@ def _random(*shape: int, seed: int = 0) -> Tensor:
 
 
 @dataclass(frozen=True)
-class HeadScene:
-    """Gaussians on an ellipsoid before a camera, as tensors of ``rasterize``."""
+class RasterScene:
+    """Gaussians before a camera, as tensors of ``rasterize``."""
 
     gaussians: tuple[Tensor, ...]
     viewmat: Tensor
@@ -88,7 +91,7 @@ class HeadScene:
         return out.image.square().sum()
 
 
-def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> HeadScene:
+def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> RasterScene:
     """The benchmark's scene: ``n`` Gaussians whose sizes cover the ellipsoid whatever ``n`` is, seen from 3.6 m."""
     g = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
@@ -104,10 +107,10 @@ def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: b
     K = torch.tensor([[focal, 0.0, size[0] / 2], [0.0, focal, size[1] / 2], [0.0, 0.0, 1.0]])
     gaussians = (directions * torch.tensor([0.75, 1.0, 0.85]), quats, scales, opacities, colors)
     leaves = tuple(tensor.to(device).requires_grad_() for tensor in gaussians)
-    return HeadScene(leaves, viewmat.to(device), K.to(device), size)
+    return RasterScene(leaves, viewmat.to(device), K.to(device), size)
 
 
-def _ellipse_pixels(scene: HeadScene) -> float:
+def _ellipse_pixels(scene: RasterScene) -> float:
     """Pixels inside all ellipses where alpha reaches the threshold, hidden or not."""
     background = scene.viewmat.new_zeros(3)
     detached = tuple(tensor.detach() for tensor in scene.gaussians)
@@ -118,13 +121,60 @@ def _ellipse_pixels(scene: HeadScene) -> float:
 
 def raster_job(name: str, n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> Job:
     """Projection to image and back."""
-    scene = head_scene(n, size, device, opaque=opaque)
+    return _scene_job(name, head_scene(n, size, device, opaque=opaque))
+
+
+def _scene_job(name: str, scene: RasterScene) -> Job:
     return Job(
         name=name,
-        work=f"{n // 1000}K, {size[0]} x {size[1]}",
+        work=_work_of(scene),
         step=_autograd(lambda: scene.loss(RasterSettings())),
         plain=_autograd(lambda: scene.loss(RasterSettings(form="plain"))),
         operations=sum(RASTER_OPERATIONS) * _ellipse_pixels(scene),
+    )
+
+
+def _work_of(scene: RasterScene) -> str:
+    return f"{len(scene.gaussians[0]) // 1000}K, {scene.size[0]} x {scene.size[1]}"
+
+
+def avatar_job(path: Path, device: torch.device) -> Job:
+    """A fitted avatar in its mean pose, from the camera in the middle of those it was fitted to.
+
+    Raises:
+        DataError: If ``path`` holds no avatar.
+    """
+    avatar = Avatar.load(path, device=device)
+    camera = avatar.capture.mean_camera()
+    gaussians = avatar.gaussians(mean_pose(avatar), camera)
+    leaves = tuple(
+        tensor.detach().clone().requires_grad_()
+        for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    )
+    viewmat, K = (torch.from_numpy(matrix).to(leaves[0]) for matrix in (camera.viewmat, camera.K))
+    return _scene_job("rasterize, fitted avatar", RasterScene(leaves, viewmat, K, (camera.width, camera.height)))
+
+
+def views_job(n: int, size: tuple[int, int], device: torch.device, *, n_views: int = 4) -> Job:
+    """The head from all around in one launch; plain: one launch a view."""
+    scene = head_scene(n, size, device)
+    viewmats = scene.viewmat.repeat(n_views, 1, 1)
+    for viewmat, angle in zip(viewmats, torch.linspace(0, 2 * math.pi, n_views + 1)[:-1], strict=True):
+        sine, cosine = float(angle.sin()), float(angle.cos())
+        viewmat[0, 0], viewmat[0, 2], viewmat[2, 0], viewmat[2, 2] = cosine, sine, -sine, cosine
+    view_ids = torch.arange(n_views, dtype=torch.int32, device=device).repeat_interleave(n)
+    views = [replace(scene, viewmat=viewmat) for viewmat in viewmats]
+
+    def together() -> Tensor:
+        gaussians = [torch.cat([tensor] * n_views) for tensor in scene.gaussians]
+        return rasterize(*gaussians, viewmat=viewmats, K=scene.K, size=size, view_ids=view_ids).image.square().sum()
+
+    return Job(
+        name="rasterize, several views",
+        work=f"{n_views} x {_work_of(scene)}",
+        step=_autograd(together),
+        plain=_autograd(lambda: torch.stack([view.loss(RasterSettings()) for view in views]).sum()),
+        operations=sum(RASTER_OPERATIONS) * sum(_ellipse_pixels(view) for view in views),
     )
 
 
@@ -331,11 +381,14 @@ def _uv_job(verts: Tensor, faces: Tensor, uv: Tensor, side: int = 256) -> Job:
     )
 
 
-def jobs(device: torch.device) -> Iterator[Job]:
-    """All rows of the table, made one at a time."""
+def jobs(device: torch.device, avatar: Path | None = None) -> Iterator[Job]:
+    """All rows of the table, made one at a time; ``avatar`` is a fitted one's file, if there is one."""
     yield raster_job("rasterize", 20_000, (512, 512), device)
     yield raster_job("rasterize", 100_000, (802, 550), device)
     yield raster_job("rasterize, opaque", 20_000, (512, 512), device, opaque=True)
+    yield views_job(20_000, (256, 256), device)
+    if avatar is not None:
+        yield avatar_job(avatar, device)
     yield lbs_job(device)
     yield hash_grid_job(device)
     yield ssim_job(device)

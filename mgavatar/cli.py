@@ -307,23 +307,41 @@ def _as_json(metrics: dict[str, Any]) -> str:
 
 
 def bench(
-    what: Annotated[Literal["kernels"], tyro.conf.Positional],
+    what: Annotated[Literal["kernels", "trade"], tyro.conf.Positional],
     *,
     threads: int | None = None,
     json: Path | None = None,
     device: Device = "cpu",
+    avatar: Path | None = None,
+    data: Path | None = None,
+    out: Path = Path("trade"),
+    views: int = 4,
 ) -> None:
-    """Measure this machine: ``kernels`` against their plain form and the machine's floor, in one run.
+    """Measure this machine: ``kernels`` against their plain form and the machine's floor, or what shortcuts ``trade``.
 
     Args:
         what: What to measure.
         threads: CPU threads of the kernels, all cores by default.
-        json: Also write the rows here.
-        device: Where to compute.
+        json: kernels: also write the rows here.
+        device: kernels: where to compute; trade runs on a CPU.
+        avatar: avatar.pt, or the folder of its fit; kernels times it beside the made-up scenes.
+        data: trade: the capture that it was fitted to.
+        out: trade: folder for trade.json, trade.md and trade.png.
+        views: trade: number of training views to measure on.
     """
+    if what == "trade":
+        from mgavatar.bench_trade import bench_trade
+
+        if avatar is None or data is None:
+            raise DataError("bench trade: give --avatar and --data, the avatar and the capture that it was fitted to")
+        if views < 1 or (threads is not None and threads < 1):
+            raise DataError("bench trade: --views and --threads must be at least 1")
+        print(bench_trade(_avatar_path(avatar), data, out=out, views=views, threads=threads))
+        return
     from mgavatar.bench import bench_kernels
 
-    print(bench_kernels(threads=threads, json_path=json, device=_device(device).type))
+    chosen = _avatar_path(avatar) if avatar else None
+    print(bench_kernels(threads=threads, json_path=json, device=_device(device).type, avatar=chosen))
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {
@@ -355,6 +373,7 @@ def main() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
     logging.basicConfig(format="mgavatar: %(message)s")
+    logging.getLogger("mgavatar").setLevel(logging.INFO)
     try:
         tyro.extras.subcommand_cli_from_dict(
             _COMMANDS, prog="mgavatar", args=_with_preset(sys.argv[1:]), description="Drivable Gaussian head avatars."

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
@@ -24,9 +25,14 @@ from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.stage import GeometryStage, VertexGaussians
-from mgavatar.head.body import Body
+from mgavatar.head.body import FINE_ENOUGH, Body
 from mgavatar.head.model import HeadModel
 from mgavatar.progress import MetricsLog, Reporter
+
+FINE_EDGE = 4.0
+"""An edge of so few pixels [px] is not worth splitting."""
+
+log = logging.getLogger("mgavatar")
 
 
 class Stage(Protocol):
@@ -159,13 +165,14 @@ def fit(
         Interrupted: After Ctrl-C; the avatar as far as it came has been saved.
     """
     torch.manual_seed(seed)
+    config = with_subdivisions(config, head_model, subject)
     checkpoint = _read_checkpoint(run, config, seed) if resume else None
     run.folder.mkdir(parents=True, exist_ok=True)
     if checkpoint is None:
         (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
     capture = CaptureInfo.of(subject)
-    log = MetricsLog(run.metrics)
-    loop = _Loop(config, run, log, torch.tensor(subject.background, device=device), seed)
+    metrics = MetricsLog(run.metrics)
+    loop = _Loop(config, run, metrics, torch.tensor(subject.background, device=device), seed)
     body = Body(head_model, subdivisions=config.geometry.subdivisions, device=device)
     head = PersonalHead(body, subject.params, config.geometry)
     vertex_gaussians = VertexGaussians(head, config)
@@ -195,9 +202,26 @@ def fit(
             state=lambda: {"geometry": finished, "appearance": stage.state_dict()},
         )
     finally:
-        log.close()
+        metrics.close()
     avatar.save(run.avatar)
     return avatar
+
+
+def with_subdivisions(config: FitConfig, head_model: HeadModel, subject: Subject) -> FitConfig:
+    """Settle ``auto``: the mesh that the images can show. The number goes into the avatar."""
+    if config.geometry.subdivisions != "auto":
+        return config
+    frame = subject.frames["train"][0]
+    camera = frame.camera
+    shrink = min(1.0, config.appearance.max_image_size / max(camera.width, camera.height))
+    verts, faces = head_model.v_template, head_model.faces
+    edge = float(np.linalg.norm(verts[faces] - verts[np.roll(faces, -1, axis=1)], axis=2).mean())
+    center = verts.mean(0) + subject.params.translation[frame.timestep]
+    depth = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
+    pixels = shrink * camera.K[0, 0] * edge / max(depth, 1e-6)
+    times = 1 if len(verts) < FINE_ENOUGH and pixels > FINE_EDGE else 0
+    log.info("%d subdivisions: %d vertices, edges of %.1f mm are %.1f px", times, len(verts), 1e3 * edge, pixels)
+    return replace(config, geometry=replace(config.geometry, subdivisions=times))
 
 
 def _done(checkpoint: dict[str, Any] | None, stage: Stage) -> int:

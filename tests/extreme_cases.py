@@ -72,8 +72,9 @@ def _run(op: Callable[..., Any], inputs: Sequence[Tensor], mask: Tensor | None) 
     total = sum((o * w.to(o)).sum() for o, w in zip(outputs, weights, strict=True))
     grads = torch.autograd.grad(total, leaves, allow_unused=True) if total.requires_grad else [None] * len(leaves)
     filled = [torch.zeros_like(x) if grad is None else grad for x, grad in zip(leaves, grads, strict=True)]
-    kept = [o.detach().double() if mask is None else o.detach().double() * mask for o in outputs]
-    return kept, [grad.double() for grad in filled]
+    values = [o.detach().cpu().double() for o in outputs]
+    kept = values if mask is None else [value * mask for value in values]
+    return kept, [grad.cpu().double() for grad in filled]
 
 
 def _mask(case: Case, inputs: Sequence[Tensor]) -> Tensor | None:
@@ -87,12 +88,13 @@ def _relative(got: Tensor, want: Tensor, norm: Callable[[Tensor], Tensor], floor
     return error if bool(got.isfinite().all()) else float("inf")
 
 
-def measure(case: Case, dtype: torch.dtype, **build: Any) -> Measured:
-    """Run one row that is not refused; what is not finite has an infinite error."""
+def measure(case: Case, dtype: torch.dtype, *, device: torch.device | str = "cpu", **build: Any) -> Measured:
+    """Run one row that is not refused; what is not finite has an infinite error. The twin runs on the CPU."""
     inputs = [tensor.to(dtype) for tensor in case.inputs(torch.Generator().manual_seed(11))]
-    got, got_grads = _run(lambda *t: case.op(*t, **build), inputs, mask := _mask(case, inputs))
+    placed = [tensor.to(device) for tensor in inputs]
+    got, got_grads = _run(lambda *t: case.op(*t, **build), placed, mask := _mask(case, inputs))
     if case.expect == "culled":
-        want, want_grads = _run(lambda *t: case.twin(*t, **build), inputs, mask)  # type: ignore[misc]
+        want, want_grads = _run(lambda *t: case.twin(*t, **build), placed, mask)  # type: ignore[misc]
     else:
         want, want_grads = _run(case.twin, [tensor.double() for tensor in inputs], mask)  # type: ignore[arg-type]
     pairs, grad_pairs = zip(got, want, strict=True), zip(got_grads, want_grads, strict=True)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from itertools import islice
 
 import pytest
 import torch
+from tiny_avatar import tiny_avatar
 
 from mgavatar import bench, bench_work
+from mgavatar.errors import DataError
 from mgavatar.kernels import bridge
+from mgavatar.render import mean_pose
 
 CPU = torch.device("cpu")
 
@@ -23,6 +27,7 @@ def loss_of(step):
     [
         bench_work.raster_job("rasterize", 2000, (64, 48), CPU),
         bench_work.raster_job("rasterize, opaque", 2000, (64, 48), CPU, opaque=True),
+        bench_work.views_job(1000, (64, 48), CPU),
         bench_work.lbs_job(CPU, n_verts=2000, n_dirs=9),
         *bench_work.mesh_jobs(CPU),
     ],
@@ -33,6 +38,27 @@ def test_plain_forms_compute_the_same(job):
     value = loss_of(job.step)
     assert value > 0
     assert loss_of(job.plain) == pytest.approx(value, rel=1e-4)
+
+
+def test_a_fitted_avatar_is_timed_as_it_is_drawn(tmp_path):
+    """Its own Gaussians from its own camera; what it is drawn on does not matter."""
+    avatar, _ = tiny_avatar(tmp_path)
+    avatar.save(tmp_path / "avatar.pt")
+    job = bench_work.avatar_job(tmp_path / "avatar.pt", CPU)
+    drawn = avatar.render(mean_pose(avatar), avatar.capture.mean_camera(), background=torch.zeros(3))
+    assert drawn.alpha.mean() > 0.02
+    assert loss_of(job.step) == pytest.approx(float(drawn.image.square().sum()), rel=1e-4)
+    assert loss_of(job.plain) == pytest.approx(loss_of(job.step), rel=1e-4)
+    assert job.operations > 0
+    names = [job.name for job in islice(bench_work.jobs(CPU, tmp_path / "avatar.pt"), 5)]
+    assert names[3:] == ["rasterize, several views", "rasterize, fitted avatar"]
+
+
+def test_a_file_that_is_no_avatar_is_named(tmp_path):
+    """The path is in the message."""
+    (tmp_path / "avatar.pt").write_bytes(b"no avatar")
+    with pytest.raises(DataError, match=r"avatar\.pt"):
+        bench_work.avatar_job(tmp_path / "avatar.pt", CPU)
 
 
 def test_the_hash_grid_and_its_plain_form_take_the_same_steps():
@@ -57,7 +83,8 @@ def test_exponent_of_a_power_law():
 
 def test_table_and_json(monkeypatch, tmp_path):
     """One small row goes all the way; threads are put back."""
-    monkeypatch.setattr(bench, "jobs", lambda device: iter([bench_work.raster_job("rasterize", 500, (32, 32), device)]))
+    small = bench_work.raster_job("rasterize", 500, (32, 32), CPU)
+    monkeypatch.setattr(bench, "jobs", lambda device, avatar: iter([small]))
     monkeypatch.setattr(bench, "_exponents", lambda device: {"Gaussians": 1.0})
     share = bench._blending_share
     monkeypatch.setattr(bench, "_blending_share", lambda n, size, device: share(n // 40, (64, 64), device))

@@ -15,11 +15,13 @@ from mgavatar import cli
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.appearance.offset_net import N_OFFSETS, OffsetNet
 from mgavatar.config import (
+    ACCURACY,
     AppearanceConfig,
     ColorNetConfig,
     FitConfig,
     GeometryConfig,
     OffsetNetConfig,
+    RasterConfig,
     check,
     from_dict,
     preset_flags,
@@ -288,6 +290,7 @@ def test_a_preset_that_cannot_be_read(preset, text, words, tmp_path, monkeypatch
         ("appearance.density", "every", 0, "--appearance.density.every"),
         ("raster", "alpha_threshold", -0.1, "--raster.alpha-threshold"),
         ("raster", "stop", 0.6, "--raster.stop"),
+        ("raster", "accuracy", "perfect", "--raster.accuracy"),
     ],
 )
 def test_numbers_that_cannot_work_are_refused(section, key, value, flag):
@@ -297,6 +300,29 @@ def test_numbers_that_cannot_work_are_refused(section, key, value, flag):
         table = {name: table}
     with pytest.raises(DataError, match=re.escape(flag)):
         check(from_dict(table))
+
+
+def test_an_accuracy_level_stands_for_two_thresholds(monkeypatch):
+    """The level decides unless a threshold is given; levels are ordered, and the default is the field's."""
+    assert FitConfig().raster.thresholds() == ACCURACY["balanced"] == (1 / 255, 1e-4)
+    chosen = parsed(monkeypatch, "--raster.accuracy", "fast").raster
+    assert chosen.thresholds() == ACCURACY["fast"]
+    chosen = parsed(monkeypatch, "--raster.accuracy", "fast", "--raster.stop", "0").raster
+    assert chosen.thresholds() == (ACCURACY["fast"][0], 0.0)
+    levels = [ACCURACY[name] for name in ("exact", "accurate", "balanced", "fast")]
+    assert levels == sorted(levels)
+    assert len(set(levels)) == len(levels)
+
+
+def test_thresholds_that_are_not_given_stay_out_of_the_file(tmp_path, monkeypatch):
+    """TOML has no word for None; what is given survives, and so do avatars from before there were levels."""
+    assert "alpha_threshold" not in to_toml(FitConfig())
+    config = FitConfig(raster=RasterConfig(accuracy="accurate", stop=1e-3))
+    path = tmp_path / "config.toml"
+    path.write_text(to_toml(config))
+    assert parsed(monkeypatch, "--preset", str(path)) == config
+    old = from_dict({"raster": {"alpha_threshold": 1 / 64, "stop": 0.0}})
+    assert old.raster.thresholds() == (1 / 64, 0.0)
 
 
 def test_the_defaults_pass_the_checks():

@@ -24,7 +24,7 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, from_dict
 from mgavatar.errors import DataError
-from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run
+from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run, with_subdivisions
 from mgavatar.geometry.stage import GeometryStage
 
 STAGES = {"geometry": GeometryStage, "appearance": AppearanceStage}
@@ -130,11 +130,24 @@ def test_a_fit_leaves_a_usable_avatar(whole, subject):
     assert (image - target).square().mean() < 0.5 * (1.0 - target).square().mean()
 
 
-def test_what_is_in_the_folder(whole):
+def test_what_is_in_the_folder(whole, subject):
     """Configuration, log, checkpoint and avatar; nothing half-written."""
     names = sorted(path.name for path in whole.folder.iterdir())
     assert names == ["avatar.pt", "checkpoint.pt", "config.toml", "metrics.jsonl"]
-    assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text())) == tiny_config()
+    settled = with_subdivisions(tiny_config(), tiny_head(), subject)
+    assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text())) == settled
+
+
+@pytest.mark.parametrize(("zoom", "size", "times"), [(1.0, 8192, 1), (0.01, 8192, 0), (1.0, 16, 0)])
+def test_subdivision_goes_by_what_the_images_show(subject, zoom, size, times):
+    """A coarse head is subdivided where its edges are long in the images that the fit will see, and not otherwise."""
+    frame = subject.frames["train"][0]
+    near = replace(frame.camera, K=frame.camera.K * np.array([[zoom], [zoom], [1.0]]))
+    seen = replace(subject, frames={**subject.frames, "train": (replace(frame, camera=near),)})
+    auto = tiny_config(geometry={"subdivisions": "auto"}, appearance={"max_image_size": size})
+    assert with_subdivisions(auto, tiny_head(), seen).geometry.subdivisions == times
+    fixed = tiny_config(geometry={"subdivisions": 2})
+    assert with_subdivisions(fixed, tiny_head(), seen) is fixed
 
 
 def test_the_log(whole):

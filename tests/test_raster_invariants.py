@@ -97,12 +97,13 @@ def test_equal_depths_keep_the_order_of_the_input(device, form):
     assert_same_bits(all_of(flat), all_of(flat))
 
 
-def test_tiles_and_rows_give_the_same_result():
-    """16 x 16 tiles, one thread a pixel, against 128 x 16 tiles, eight pixels at a time."""
+def test_tiles_and_rows_give_the_same_result(device):
+    """16 x 16 tiles, one thread a pixel, on any device, against the CPU's 128 x 16 tiles, eight pixels at a time."""
     assert (compositing.TILE, compositing.TILE) != (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT)
     scene = dense(torch.device("cpu"))
     cotangent = cotangent_for(scene) * decided(scene)
-    plain, rows = (all_of(scene.knobs(form=form), cotangent) for form in ("plain", "rows"))
+    plain = all_of(scene.to(device).knobs(form="plain"), cotangent)
+    rows = all_of(scene.knobs(form="rows"), cotangent)
     assert ((plain[0] - rows[0]) * (cotangent != 0)).abs().max() <= 2e-6
     for name, a, b in zip(NAMES, plain[1:], rows[1:], strict=True):
         assert (a - b).norm() <= 5e-6 * a.norm(), name

@@ -297,19 +297,20 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("message", REFUSALS)
-def test_bad_input_is_refused(message):
+def test_bad_input_is_refused(message, device):
     """One line that names the argument, what it has and what is needed."""
-    scene = ball_scene(5, (8, 8))
-    arguments = {name: getattr(scene, name) for name in (*NAMES, "K", "size", "settings")} | REFUSALS[message]
+    scene = ball_scene(5, (8, 8)).to(device)
+    bad = {name: v.to(device) if isinstance(v, torch.Tensor) else v for name, v in REFUSALS[message].items()}
+    arguments = {name: getattr(scene, name) for name in (*NAMES, "K", "size", "settings")} | bad
     with pytest.raises(ValueError) as caught:  # noqa: PT011
         rasterize(**arguments)
-    assert str(caught.value) == message
+    assert str(caught.value).replace(str(scene.means.device), "cpu") == message
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32])
-def test_other_precisions_are_refused(dtype):
+def test_other_precisions_are_refused(dtype, device):
     """Only float32 and float64 have kernels; rows only float32."""
-    scene = ball_scene(5, (8, 8))
+    scene = ball_scene(5, (8, 8)).to(device)
     with pytest.raises(ValueError, match="needs float32 or float64"):
         render(scene.to(dtype))
     with pytest.raises(ValueError, match="form 'rows' needs float32 on a CPU"):

@@ -50,7 +50,7 @@ class AppearanceStage:
         ]
         if appearance.offset_net is not None:
             groups.append({"params": list(appearance.offset_net.parameters()), "lr": a.offset_net.lr})
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self.decay = a.final_lr ** (1.0 / max(1, a.iterations))
         self.density = DensityControl(g, a.density, extent=appearance.frozen.extent, seed=seed)
 

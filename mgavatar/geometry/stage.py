@@ -87,7 +87,7 @@ class GeometryStage:
             {"params": [gaussians.log_scales], "lr": g.lr_scale},
             {"params": [gaussians.colors], "lr": g.lr_color},
         ]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
+        self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         decay = g.final_lr ** (1.0 / max(1, g.iterations))
         self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimizer, decay)
 

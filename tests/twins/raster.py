@@ -124,6 +124,30 @@ def rasterize(
     return torch.cat(chunks, 1).reshape(5, size[1], size[0])
 
 
+def rasterize_views(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    backgrounds: Tensor,
+    *,
+    K: Tensor,
+    view_ids: Tensor,
+    size: tuple[int, int],
+    settings: RasterSettings,
+) -> Tensor:
+    """Each view from its own Gaussians, one after the other, shape [B, 5, H, W]."""
+    gaussians = (means, quats, scales, opacities, colors)
+    return torch.stack(
+        [
+            rasterize(*(t[view_ids == b] for t in gaussians), viewmat, background, K=K[b], size=size, settings=settings)
+            for b, (viewmat, background) in enumerate(zip(viewmats, backgrounds, strict=True))
+        ]
+    )
+
+
 @torch.no_grad()
 def decided(
     means: Tensor,
