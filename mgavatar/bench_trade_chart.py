@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
@@ -13,7 +14,7 @@ from mgavatar.bench_trade_work import Row
 
 _SIZE = (1500, 760)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 92, 30, 56, 66
-_TEXT, _SMALL, _MARK = 19, 16, 8
+_TEXT, _SMALL, _MARK, _LEVEL = 19, 16, 8, 15
 _INK, _GRID, _PAPER = "#202428", "#dfe3e8", "#ffffff"
 _COLORS = {
     "raster.accuracy": "#111111",
@@ -61,7 +62,9 @@ def _numbers(row: Row) -> list[str]:
 def _share(value: float | None) -> str:
     if value is None:
         return ""
-    return f"{100 * value:.2g} %" if value >= 1e-3 else f"{value:.1e}"
+    if value < 1e-3:
+        return f"{value:.1e}"
+    return f"{100 * value:.0f} %" if value >= 0.1 else f"{100 * value:.2g} %"
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,8 @@ def _repeats(row: Row) -> bool:
 
 def _mark(row: Row, height: float) -> _Mark:
     label = row.value if row.knob in ("raster.accuracy", "storage") else f"{row.knob} {row.value}"
+    if row.knob == "storage" and row.default:
+        label += ": rounding alone"
     ratio = row.ratio or 1.0
     if ratio > _FARTHEST:
         label += f": {ratio:.0f}x"
@@ -127,9 +132,9 @@ def _panel(
     axes = _axes(marks, top)
     _frame(pen, axes, title, unit)
     levels = [axes.place(mark.ratio, mark.height) for mark in marks if mark.knob == "raster.accuracy"]
-    if len(levels) > 1:
-        pen.line(levels, fill=_COLORS["raster.accuracy"], width=2)
+    pen.line(levels, fill=_COLORS["raster.accuracy"], width=2)
     taken = [_box(*axes.place(mark.ratio, mark.height), _MARK + 1) for mark in marks]
+    taken += [_box(x, y, 3.0) for a, b in pairwise(levels) for x, y in _between(a, b)]
     for mark in sorted(marks, key=lambda mark: (mark.knob != "raster.accuracy", -mark.height)):
         _draw_mark(pen, mark, axes, taken)
 
@@ -173,8 +178,9 @@ def _draw_mark(
     level = mark.knob == "raster.accuracy"
     font = ImageFont.load_default(_TEXT if level else _SMALL)
     color = _COLORS[mark.knob]
+    gap = 6 + (_LEVEL if level else _MARK)
     left, up, right, down = pen.textbbox((0, 0), mark.label, font=font, anchor="lm")
-    places = [(dx, dy) for dy in _spread(18, 16) for dx in (_MARK + 6, -_MARK - 6 - right, 70, -70 - right, 150)]
+    places = [(dx, dy) for dy in _spread(18, 16) for dx in (gap, -gap - right, 70, -70 - right, 150)]
     places.sort(key=lambda place: abs(place[1]) + 0.3 * abs(place[0] + (right if place[0] < 0 else 0)))
     dx, dy = next(
         (
@@ -188,10 +194,15 @@ def _draw_mark(
     if abs(dy) > 10 or dx > 40 or dx < -40 - right:
         pen.line([(x, y), (x + (dx - 2 if dx > 0 else dx + right + 2), y + dy)], fill=color, width=1)
     if level:
-        pen.polygon([(x, y - 11), (x + 11, y), (x, y + 11), (x - 11, y)], fill=color)
+        pen.polygon([(x, y - _LEVEL), (x + _LEVEL, y), (x, y + _LEVEL), (x - _LEVEL, y)], fill=color)
     else:
         pen.ellipse(_box(x, y, _MARK), fill=color, outline=_PAPER)
     pen.text((x + dx, y + dy), mark.label, fill=color, font=font, anchor="lm")
+
+
+def _between(a: tuple[float, float], b: tuple[float, float], n: int = 60) -> list[tuple[float, float]]:
+    """Points of a line that labels keep away from."""
+    return [(a[0] + (b[0] - a[0]) * k / n, a[1] + (b[1] - a[1]) * k / n) for k in range(n + 1)]
 
 
 def _spread(step: int, n: int) -> list[int]:

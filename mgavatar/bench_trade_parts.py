@@ -204,7 +204,7 @@ def hash_rows(avatar: Avatar, scenes: Sequence[Scene], *, steps: int) -> list[Ro
                 psnr=fitted,
                 worst=worst,
                 gradient={},
-                note=f"PSNR of {len(points)} points' colours after {steps} steps; held-out points {held_out:.1f} dB",
+                note=f"PSNR of colours learned in {steps} steps; of points held out {held_out:.1f} dB",
             )
         )
     return rows

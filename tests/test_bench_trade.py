@@ -13,9 +13,11 @@ from tiny_avatar import tiny_avatar
 from mgavatar import bench_trade as trade
 from mgavatar import bench_trade_parts as parts
 from mgavatar import bench_trade_work as work
+from mgavatar import cli
 from mgavatar.bench_trade_chart import table
-from mgavatar.config import ACCURACY
+from mgavatar.config import ACCURACY, RasterConfig
 from mgavatar.errors import DataError
+from mgavatar.gaussians import Gaussians, draw
 from mgavatar.losses import ssim
 
 KNOBS = {
@@ -106,6 +108,16 @@ def test_levels_are_ordered_and_are_their_thresholds(run):
     assert {name: (s.alpha_threshold, s.stop) for name, s in settings.items()} == ACCURACY
 
 
+def test_drawing_follows_the_level(reference):
+    """What the table calls a level is what an avatar with that configuration is drawn with."""
+    scene = reference.scenes[0]
+    gaussians = Gaussians(*scene.gaussians)
+    for setting in work.raster_knobs()[0]:
+        config = RasterConfig(accuracy=setting.value)
+        image = draw(gaussians, scene.camera, background=scene.background, config=config).image
+        assert torch.equal(image, work.run_step(scene, setting.timed, setting).image)
+
+
 def test_what_is_emulated_has_an_effect(run):
     """The edit reaches the blending and is gone afterwards; rounding to half costs more than to single precision."""
     rows = run[0]
@@ -176,6 +188,17 @@ def test_cells():
 def test_fractions(value, text):
     """As a person would write them."""
     assert work.fraction(value) == text
+
+
+def test_the_command_asks_for_avatar_and_capture(monkeypatch, capsys):
+    """One line that says what to give, before anything is loaded."""
+    monkeypatch.setattr("sys.argv", ["mgavatar", "bench", "trade", "--avatar", "avatar.pt"])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 1
+    assert capsys.readouterr().err == (
+        "mgavatar: bench trade: give --avatar and --data, the avatar and the capture that it was fitted to\n"
+    )
 
 
 def test_refusals(tmp_path):
