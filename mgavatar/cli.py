@@ -40,6 +40,11 @@ def _device(name: Device) -> torch.device:
     return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
 
 
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**31:
+        raise DataError(f"--seed {seed}: must lie between 0 and {2**31 - 1}")
+
+
 def _checked_capture(data: Path, principal_point: Literal["center", "opencv", "opengl"]) -> Subject:
     """Read a capture and decode every image once: what is wrong with it is said before any work."""
     from mgavatar.capture.images import check_images
@@ -69,6 +74,7 @@ def demo(
     """
     from mgavatar.demo import run_demo
 
+    _check_seed(seed)
     configs.check(config)
     _say_notes(_score_lines(run_demo(out, config, device=_device(device), seed=seed)))
     print(out / "run" / "report.html")
@@ -97,6 +103,8 @@ def synth(
     """
     from mgavatar.capture.synthetic import make_synthetic_capture
     from mgavatar.progress import Reporter
+
+    _check_seed(seed)
 
     with Reporter("synth", timesteps * (1 if monocular else cameras)) as reporter:
         make_synthetic_capture(
@@ -154,6 +162,7 @@ def fit(
     from mgavatar.fit import Interrupted, open_run
     from mgavatar.fit import fit as run_fit
 
+    _check_seed(seed)
     configs.check(config)
     run = open_run(out, resume=resume)
     chosen = _device(device)
