@@ -14,7 +14,8 @@ from torch.autograd.function import once_differentiable
 from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype
 
-_BLOCK = 4096  # numbers that one CPU item adds up, so that they stay in the first-level cache
+_BLOCK = 16384  # numbers that one CPU item adds up: they stay in its cache, and directions are read in long pieces
+_DIRECTIONS = 8  # that one CPU item multiplies with the gradient
 _LANES = 64  # partial sums of a dot product, the same on a CPU (vector lanes) and on CUDA (threads)
 
 # Four directions a pass: a sum is loaded and stored once for four products. Directions whose coefficient is exactly
@@ -64,17 +65,39 @@ _DOT_SNIPPET = """
         sums[lane] = sum;
         return;
     }
-    REAL lanes[LANES];
-    for (int l = 0; l < LANES; ++l)
-        lanes[l] = 0;
+#if !defined(__CUDACC__)
+    // An item owns a few whole directions, and a piece of the gradient serves them all while it is in the cache.
+    enum { PART = LANES / 4, PIECE = 4096 };
+    typedef REAL part __attribute__((ext_vector_type(PART), aligned(sizeof(REAL))));
+    const int count = partial.shape[0] - k < width / LANES ? partial.shape[0] - k : width / LANES;
+    for (int l = 0; l < count * LANES; ++l)
+        sums[l] = 0;
     const long long whole = n - n % LANES;
-    for (long long i = 0; i < whole; i += LANES)
-        for (int l = 0; l < LANES; ++l)
-            lanes[l] += d[i + l] * g[i + l];
-    for (long long i = whole; i < n; ++i)
-        lanes[i - whole] += d[i] * g[i];
-    for (int l = 0; l < LANES; ++l)
-        sums[l] = lanes[l];
+    for (long long from = 0; from < whole; from += PIECE) {
+        const long long to = from + PIECE < whole ? from + PIECE : whole;
+        for (int m = 0; m < count; ++m) {
+            const REAL* e = d + m * n;
+            part* s = (part*)(sums + m * LANES);
+            part s0 = s[0], s1 = s[1], s2 = s[2], s3 = s[3];
+            for (long long i = from; i < to; i += LANES) {
+                // The hardware starts anew at every page of every direction; asking ahead is 1.3 to 1.8 times faster.
+                for (int ahead = 0; ahead < LANES; ahead += PART)
+                    __builtin_prefetch(e + i + 1024 + ahead);
+                s0 += *(const part*)(e + i) * *(const part*)(g + i);
+                s1 += *(const part*)(e + i + PART) * *(const part*)(g + i + PART);
+                s2 += *(const part*)(e + i + 2 * PART) * *(const part*)(g + i + 2 * PART);
+                s3 += *(const part*)(e + i + 3 * PART) * *(const part*)(g + i + 3 * PART);
+            }
+            s[0] = s0;
+            s[1] = s1;
+            s[2] = s2;
+            s[3] = s3;
+        }
+    }
+    for (int m = 0; m < count; ++m)
+        for (long long i = whole; i < n; ++i)
+            sums[m * LANES + i - whole] += d[m * n + i] * g[i];
+#endif
 """
 
 
@@ -122,7 +145,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     def blend_bwd_kernel(
         first: int,
         # In:
-        width: int,  # lanes an item owns, 1 or all
+        width: int,  # lanes an item owns: 1, or all those of a few directions
         dirs: wp.array2d(dtype=scalar),  # [K, 3V]
         grad: wp.array(dtype=scalar),  # [3V]
         # Out:
@@ -174,9 +197,9 @@ class BlendShapes(torch.autograd.Function):
         n_dirs = len(dirs)
         partial = grad.new_zeros(n_dirs, _LANES)
         grad_coeffs = grad.new_zeros(n_dirs)
-        width = 1 if grad.is_cuda else _LANES
+        width = 1 if grad.is_cuda else _DIRECTIONS * _LANES
         if dirs.numel():
             inputs = (width, dirs.reshape(n_dirs, -1), grad.reshape(-1))
-            launch_ranges(kernels.blend_bwd, n_dirs * _LANES // width, inputs, (partial,))
+            launch_ranges(kernels.blend_bwd, -(-n_dirs * _LANES // width), inputs, (partial,))
             launch(kernels.sum, n_dirs, (partial,), (grad_coeffs,))
         return grad, None, grad_coeffs
