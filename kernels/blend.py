@@ -184,7 +184,7 @@ class BlendShapes(torch.autograd.Function):
         n_items = -(-start.numel() // width)
         if n_items:
             inputs = (width, dirs.reshape(len(dirs), start.numel()), coeffs, start.reshape(-1))
-            launch_ranges(_KERNELS[start.dtype].blend, n_items, inputs, (out.view(-1),))
+            launch_ranges(_KERNELS[start.dtype].blend, n_items, inputs, (out.view(-1),), ranges_per_thread=1)
         return out
 
     @staticmethod
@@ -200,6 +200,6 @@ class BlendShapes(torch.autograd.Function):
         width = 1 if grad.is_cuda else _DIRECTIONS * _LANES
         if dirs.numel():
             inputs = (width, dirs.reshape(n_dirs, -1), grad.reshape(-1))
-            launch_ranges(kernels.blend_bwd, -(-n_dirs * _LANES // width), inputs, (partial,))
+            launch_ranges(kernels.blend_bwd, -(-n_dirs * _LANES // width), inputs, (partial,), ranges_per_thread=1)
             launch(kernels.sum, n_dirs, (partial,), (grad_coeffs,))
         return grad, None, grad_coeffs

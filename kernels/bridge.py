@@ -83,11 +83,19 @@ def launch(
         wp.launch(kernel, dim, inputs=arguments, device=str(device))
 
 
-def launch_ranges(kernel: wp.Kernel, n_items: int, inputs: Sequence[Any], outputs: Sequence[Tensor] = ()) -> None:
+def launch_ranges(
+    kernel: wp.Kernel,
+    n_items: int,
+    inputs: Sequence[Any],
+    outputs: Sequence[Tensor] = (),
+    *,
+    ranges_per_thread: int = 8,
+) -> None:
     """Run ``kernel`` over ``n_items`` independent items; on a CPU, several threads take disjoint ranges of them.
 
     The kernel's first argument is the index of its range's first item. Items must write disjoint memory: the result
-    is then the same, bit for bit, for any number of threads.
+    is then the same, bit for bit, for any number of threads. Eight ranges a thread balance uneven items; handing out a
+    range costs some 0.07 ms, so items that cost the same take one.
     """
     device = _device([*outputs, *inputs])
     arguments = _arguments(kernel, [*inputs, *outputs], first=1)
@@ -97,7 +105,7 @@ def launch_ranges(kernel: wp.Kernel, n_items: int, inputs: Sequence[Any], output
             wp.launch(kernel, n_items, inputs=[0, *arguments], device=str(device))
         return
     kernel.module.load("cpu", 1)  # the block size of CPU launches; another one would be a second build
-    step = -(-n_items // (8 * threads))  # eight ranges a thread: uneven items balance out
+    step = -(-n_items // (ranges_per_thread * threads))
 
     def run(first: int) -> None:
         wp.launch(kernel, min(step, n_items - first), inputs=[first, *arguments], device="cpu")

@@ -115,7 +115,9 @@ class _Skin(torch.autograd.Function):
         ctx.save_for_backward(verts, weights, transforms)
         out = torch.empty_like(verts, memory_format=torch.contiguous_format)
         if len(verts):
-            launch_ranges(_KERNELS[verts.dtype].skin, len(verts), (verts, weights, transforms), (out,))
+            launch_ranges(
+                _KERNELS[verts.dtype].skin, len(verts), (verts, weights, transforms), (out,), ranges_per_thread=1
+            )
         return out
 
     @staticmethod
@@ -127,11 +129,13 @@ class _Skin(torch.autograd.Function):
         grad_verts = torch.zeros_like(verts, memory_format=torch.contiguous_format)
         grad_transforms = torch.zeros_like(transforms, memory_format=torch.contiguous_format)
         if n_verts and ctx.needs_input_grad[0]:
-            launch_ranges(kernels.verts_bwd, n_verts, (weights, transforms, grad), (grad_verts,))
+            launch_ranges(kernels.verts_bwd, n_verts, (weights, transforms, grad), (grad_verts,), ranges_per_thread=1)
         if n_verts and ctx.needs_input_grad[2]:
             n_chunks = -(-n_verts // _CHUNK)
             partial = grad.new_empty(n_joints, n_chunks, 3, 4)
-            launch_ranges(kernels.transforms_bwd, n_joints * n_chunks, (verts, weights, grad), (partial,))
+            launch_ranges(
+                kernels.transforms_bwd, n_joints * n_chunks, (verts, weights, grad), (partial,), ranges_per_thread=1
+            )
             launch(kernels.sum_transforms, (n_joints, 4, 4), (partial,), (grad_transforms,))
         return grad_verts, None, grad_transforms
 

@@ -183,7 +183,7 @@ def project(
     if n:
         inputs = [*gaussians, viewmat.view(-1, 4, 4), K.view(-1, 3, 3), view_ids, width, height, *tile]
         inputs += [settings.near, settings.low_pass, settings.alpha_threshold]
-        bridge.launch_ranges(projection.KERNELS[means.dtype][0], n, inputs, [splats, tiles, keys])
+        bridge.launch_ranges(projection.KERNELS[means.dtype][0], n, inputs, [splats, tiles, keys], ranges_per_thread=1)
     lists = build_work_lists(keys, tiles, n_columns, n_rows, view_ids=view_ids, n_views=n_views)
     return Work(splats, lists, form, n_columns, size, view_ids, n_views)
 
@@ -290,7 +290,7 @@ class _Rasterize(torch.autograd.Function):
             inputs = [means, quats, scales, viewmat.view(-1, 4, 4), K.view(-1, 3, 3), work.view_ids, *work.size]
             inputs += [settings.low_pass, work.lists.first_item, work.lists.n_items, partials]
             kernel = projection.KERNELS[means.dtype][1]
-            bridge.launch_ranges(kernel, len(means), inputs, [*grads, means2d, v_views])
+            bridge.launch_ranges(kernel, len(means), inputs, [*grads, means2d, v_views], ranges_per_thread=2)
         v_viewmat = _camera_gradient(v_views, work.view_ids, viewmat) if wants_camera else None
         v_background = _background_gradient(v_planes[0], final_T) if ctx.needs_input_grad[11] else None
         return None, None, None, None, *grads, v_viewmat, None, v_background

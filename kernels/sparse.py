@@ -112,7 +112,7 @@ class _Rows:
         out = x.new_empty(n_rows, x.shape[1])
         if out.numel():
             inputs = (self.starts, self.cols, self.values[x.dtype], x)
-            launch_ranges(pick(_KERNELS, x=x).multiply, n_rows, inputs, (out,))
+            launch_ranges(pick(_KERNELS, x=x).multiply, n_rows, inputs, (out,), ranges_per_thread=1)
         return out
 
 
