@@ -116,10 +116,12 @@ def _kernels(real: Real) -> SimpleNamespace:
         quats[n] = quat_product(q, local_quats[n])
         scales[n] = k * local_scales[n]
 
-    return SimpleNamespace(face_frames=face_frames_kernel, to_world=to_world_kernel)
+    return SimpleNamespace(
+        face_frames=face_frames_kernel, to_world=to_world_kernel, rotate=rotate, quat_product=quat_product
+    )
 
 
-_KERNELS = by_dtype(_kernels)
+KERNELS = by_dtype(_kernels)
 
 
 def gather_matrix(index: Tensor, n_rows: int) -> SparseMatrix:
@@ -180,7 +182,7 @@ def face_frames(verts: Tensor, faces: Tensor, *, order: SparseMatrix | None = No
     """
     if verts.ndim != 2 or verts.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"verts must be [V, 3] and faces [F, 3], got {tuple(verts.shape)} and {tuple(faces.shape)}")
-    kernels = pick(_KERNELS, verts=verts)
+    kernels = pick(KERNELS, verts=verts)
     corners = gather_rows(verts, faces, order=order).reshape(-1, 3, 3)
     n = len(faces)
     return taped(kernels.face_frames, n, (corners,), ((n, 4), (n,), (n, 3)))
@@ -225,5 +227,5 @@ def to_world(
     for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}; {shape} is needed for {n} Gaussians")
-    kernels = pick(_KERNELS, **tensors)
+    kernels = pick(KERNELS, **tensors)
     return taped(kernels.to_world, n, tuple(tensors.values()), ((n, 3), (n, 4), (n, 3)))

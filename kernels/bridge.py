@@ -19,7 +19,7 @@ import warp as wp
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-_n_threads = max(1, min(32, os.cpu_count() or 1))
+_n_threads = max(1, min(32, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1))
 
 
 def set_num_threads(n: int) -> None:

@@ -148,14 +148,14 @@ def blend_shapes(v_template: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
 
     Args:
         v_template: Vertices [m], shape [V, 3], float32 or float64.
-        dirs: Directions [m per unit], each contiguous, shape [K, V, 3].
+        dirs: Directions [m per unit], contiguous, shape [K, V, 3].
         coeffs: Coefficients, shape [K].
 
     Returns:
         Vertices [m], shape [V, 3].
 
     Raises:
-        ValueError: If shapes, dtypes or devices do not agree, or ``dirs`` wants a gradient.
+        ValueError: If shapes, dtypes or devices do not agree, or ``dirs`` wants a gradient or is not contiguous.
     """
     if v_template.ndim != 2 or dirs.shape[1:] != v_template.shape or tuple(coeffs.shape) != (len(dirs),):
         raise ValueError(
@@ -164,6 +164,8 @@ def blend_shapes(v_template: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
         )
     if dirs.requires_grad:
         raise ValueError("dirs requires a gradient, but blend_shapes has none for it")
+    if not dirs.is_contiguous():  # a copy would cost ten times what the blending does, in both directions
+        raise ValueError(f"dirs must be contiguous, but its strides are {dirs.stride()}")
     pick(_KERNELS, v_template=v_template, dirs=dirs, coeffs=coeffs)
     return BlendShapes.apply(v_template, dirs, coeffs)
 

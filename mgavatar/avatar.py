@@ -16,7 +16,7 @@ from mgavatar import __version__
 from mgavatar.appearance.model import Appearance, FrozenHead
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import HeadParams, Subject
-from mgavatar.config import FitConfig, check, from_dict
+from mgavatar.config import FitConfig, check, from_dict, settled
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file
 from mgavatar.gaussians import Gaussians, draw
@@ -176,7 +176,7 @@ class Avatar:
 def build_appearance(head: PersonalHead, config: FitConfig, *, seed: int) -> Appearance:
     """Freeze the head and bind one Gaussian to each of its faces."""
     offset_net = config.appearance.offset_net
-    frozen = FrozenHead(head, uv_resolution=offset_net.resolution if offset_net.enabled else None)
+    frozen = FrozenHead(head, uv_resolution=settled(offset_net.resolution) if offset_net.enabled else None)
     return Appearance(frozen, config, seed=seed)
 
 

@@ -98,7 +98,7 @@ def synth(
         timesteps: Number of timesteps.
         size: Image size, WIDTHxHEIGHT.
         seed: Of the person and of the motion.
-        monocular: One camera and a turning head.
+        monocular: One camera and a turning head, with two cameras at its sides to score novel views only.
         head_model: Head model to start from, the built-in one by default.
     """
     from mgavatar.capture.synthetic import make_synthetic_capture
@@ -115,7 +115,7 @@ def synth(
             seed=seed,
             monocular=monocular,
             head=_head(head_model) if head_model else None,
-            progress=lambda done, total: reporter.update(done),
+            progress=lambda done, total: reporter.update(done, total=total),
         )
 
 
@@ -145,6 +145,7 @@ def fit(
     device: Device = "auto",
     seed: int = 0,
     resume: bool = False,
+    budget: str | None = None,
     config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008  frozen
 ) -> None:
     """Fit an avatar to a tracked capture.
@@ -157,8 +158,13 @@ def fit(
         device: Where to compute.
         seed: Repeats a run bit for bit on one machine.
         resume: Go on with the fit in --out.
+        budget: Time after which the avatar is written, counted from now, for example 90s, 5m or 1h; iterations, rates
+            and density control are scaled to it. The score of a sample and the report come after.
         config: Every other number.
     """
+    from mgavatar.budget import Budget, parse_budget
+
+    limit = Budget(parse_budget(budget)) if budget is not None else None
     from mgavatar.fit import Interrupted, open_run
     from mgavatar.fit import fit as run_fit
 
@@ -170,7 +176,7 @@ def fit(
     subject = _checked_capture(data, config.principal_point)
     _say_notes(_capture_notes(subject, head))
     try:
-        avatar = run_fit(subject, head, config, run, device=chosen, seed=seed, resume=resume)
+        avatar = run_fit(subject, head, config, run, device=chosen, seed=seed, resume=resume, budget=limit)
     except Interrupted as stop:
         _say(f"mgavatar: {stop}; {run.avatar} is usable, `--resume` goes on")
         raise SystemExit(130) from None
@@ -316,7 +322,7 @@ def _as_json(metrics: dict[str, Any]) -> str:
 
 
 def bench(
-    what: Annotated[Literal["kernels", "trade"], tyro.conf.Positional],
+    what: Annotated[Literal["kernels", "trade", "fit"], tyro.conf.Positional],
     *,
     threads: int | None = None,
     json: Path | None = None,
@@ -326,13 +332,13 @@ def bench(
     out: Path = Path("trade"),
     views: int = 4,
 ) -> None:
-    """Measure this machine: ``kernels`` against their plain form and the machine's floor, or what shortcuts ``trade``.
+    """Measure this machine: ``kernels`` against their floor, what shortcuts ``trade``, parts of a step of a ``fit``.
 
     Args:
         what: What to measure.
         threads: CPU threads of the kernels, all cores by default.
-        json: kernels: also write the rows here.
-        device: kernels: where to compute; trade runs on a CPU.
+        json: kernels, fit: also write the rows here.
+        device: kernels, fit: where to compute; trade runs on a CPU.
         avatar: avatar.pt, or the folder of its fit; kernels times it beside the made-up scenes.
         data: trade: the capture that it was fitted to.
         out: trade: folder for trade.json, trade.md and trade.png.
@@ -346,6 +352,11 @@ def bench(
         if views < 1 or (threads is not None and threads < 1):
             raise DataError("bench trade: --views and --threads must be at least 1")
         print(bench_trade(_avatar_path(avatar), data, out=out, views=views, threads=threads))
+        return
+    if what == "fit":
+        from mgavatar.bench_fit import bench_fit
+
+        print(bench_fit(threads=threads, json_path=json, device=_device(device).type))
         return
     from mgavatar.bench import bench_kernels
 
@@ -361,6 +372,27 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "bench": bench,
 }
+
+
+_FLAGS = tyro.constructors.ConstructorRegistry()
+
+
+@_FLAGS.primitive_rule
+def _switch_or_auto(
+    info: tyro.constructors.PrimitiveTypeInfo,
+) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
+    """``--key true``, ``false`` or ``auto``: the words that a TOML file uses."""
+    if info.type != bool | Literal["auto"]:
+        return None
+    words: dict[str, Any] = {"true": True, "false": False, "auto": "auto"}
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{true,false,auto}",
+        instance_from_str=lambda given: words[given[0]],
+        is_instance=lambda value: isinstance(value, bool) or value == "auto",
+        str_from_instance=lambda value: [str(value).lower()],
+        choices=tuple(words),
+    )
 
 
 def _with_preset(argv: list[str]) -> list[str]:
@@ -384,9 +416,13 @@ def main() -> None:
     logging.basicConfig(format="mgavatar: %(message)s")
     logging.getLogger("mgavatar").setLevel(logging.INFO)
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            _COMMANDS, prog="mgavatar", args=_with_preset(sys.argv[1:]), description="Drivable Gaussian head avatars."
-        )
+        with _FLAGS:
+            tyro.extras.subcommand_cli_from_dict(
+                _COMMANDS,
+                prog="mgavatar",
+                args=_with_preset(sys.argv[1:]),
+                description="Drivable Gaussian head avatars.",
+            )
     except DataError as error:
         _say(f"mgavatar: {error}")
         raise SystemExit(1) from None

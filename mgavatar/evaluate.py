@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, HeadParams, Split, Subject
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write, float_array, read_npz
+from mgavatar.files import atomic_write
+from mgavatar.geometry_score import score_geometry
 from mgavatar.head.body import Pose, pose_of
-from mgavatar.kernels.closest_point import closest_points
 from mgavatar.losses import ssim
 from mgavatar.lpips import NO_WEIGHTS, Lpips, load_lpips
 from mgavatar.trivial import TrivialPredictors, psnr
@@ -30,8 +28,6 @@ Progress = Callable[[int, int], None]
 
 TASKS: dict[Split, str] = {"train": "training-views", "val": "novel-view", "test": "self-reenactment"}
 GEOMETRY_TIMESTEPS = 12
-REACH = 100.0
-"""Vertices of the truth that are further from the surface than this are not scored [m]."""
 
 log = logging.getLogger("mgavatar")
 
@@ -53,7 +49,7 @@ def evaluate(
 
     Args:
         avatar: The avatar.
-        subject: The capture.
+        subject: The capture; images of ``val`` and ``test`` that are in ``train`` too are left out with a warning.
         avatar_path: Where the avatar comes from, for the record.
         splits: What to score.
         lpips_weights: The state dict of ``lpips.LPIPS(net="vgg")``, or None.
@@ -67,12 +63,16 @@ def evaluate(
         predict with.
 
     Raises:
-        DataError: If no split has images, or a file is missing or damaged.
+        DataError: If no split has images that training has not seen, or a file is missing or damaged.
     """
-    frames = {split: spread(subject.frames[split], max_frames) for split in splits if subject.frames[split]}
+    held_out = {split: _held_out(subject, split) for split in splits if subject.frames[split]}
+    _warn_of_training_images(subject, held_out)
+    frames = {split: spread(own, max_frames) for split, own in held_out.items() if own}
     total = sum(len(chosen) for chosen in frames.values())
-    if not total:
+    if not held_out:
         raise DataError(f"{subject.root}: no images in {', '.join(splits)}; choose another split")
+    if not total:
+        raise DataError(f"{subject.root}: every image in {', '.join(splits)} is a training image; hold some out")
     lpips = None if lpips_weights is None else load_lpips(lpips_weights, device=avatar.device)
     _warn_of_cut_expression(avatar, subject)
     scorer = _Scorer(avatar, subject, lpips)
@@ -86,21 +86,21 @@ def evaluate(
             if progress is not None:
                 progress(done, total)
         results[split] = _summary(split, chosen, scores, has_lpips=lpips is not None)
-        if len(chosen) < len(subject.frames[split]):
-            results[split]["sampled_from"] = len(subject.frames[split])
+        if len(chosen) < len(held_out[split]):
+            results[split]["sampled_from"] = len(held_out[split])
     return {
         "avatar": str(avatar_path),
         "data": str(subject.root),
         "device": str(avatar.device),
         "splits": results,
-        "geometry": score_geometry(avatar, subject),
+        "geometry": score_geometry(avatar, subject, _geometry_poses(avatar, subject)),
         "seconds_per_frame": float(np.median(scorer.seconds)),
     }
 
 
 def evaluate_sample(avatar: Avatar, subject: Subject, *, avatar_path: Path, max_frames: int = 24) -> dict[str, Any]:
     """A quick score after a fit: some of the held-out images, or of the training images if none are held out."""
-    held_out: tuple[Split, ...] = tuple(split for split in ("val", "test") if subject.frames[split])
+    held_out: tuple[Split, ...] = tuple(split for split in ("val", "test") if _held_out(subject, split))
     return evaluate(avatar, subject, avatar_path=avatar_path, splits=held_out or ("train",), max_frames=max_frames)
 
 
@@ -115,6 +115,26 @@ def spread(items: Sequence[T], count: int | None) -> tuple[T, ...]:
     if count is None or len(items) <= count:
         return tuple(items)
     return tuple(items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int))
+
+
+def _held_out(subject: Subject, split: Split) -> tuple[Frame, ...]:
+    """The images of a split that training has not seen; all of them if it is the training split that is asked for."""
+    frames = subject.frames[split]
+    if split == "train":
+        return frames
+    places = {(frame.camera_id, frame.timestep) for frame in subject.frames["train"]}
+    files = {frame.image_path.resolve() for frame in subject.frames["train"]}
+    return tuple(
+        frame
+        for frame in frames
+        if (frame.camera_id, frame.timestep) not in places and frame.image_path.resolve() not in files
+    )
+
+
+def _warn_of_training_images(subject: Subject, held_out: dict[Split, tuple[Frame, ...]]) -> None:
+    for split, kept in held_out.items():
+        if known := len(subject.frames[split]) - len(kept):
+            log.warning("%s: %d images of %s are training images and not scored", subject.root, known, split)
 
 
 def is_own_capture(avatar: Avatar, subject: Subject) -> bool:
@@ -134,6 +154,12 @@ def evaluation_pose(avatar: Avatar, subject: Subject, timestep: int) -> Pose:
     if timestep in avatar.capture.train_timesteps and is_own_capture(avatar, subject):
         return avatar.head.pose(timestep)
     return pose_of(subject.params, timestep, avatar.head_model.n_expr)
+
+
+def _geometry_poses(avatar: Avatar, subject: Subject) -> dict[int, Pose]:
+    """Up to twelve training timesteps, spread over them, in the poses that images are scored with."""
+    timesteps = sorted({frame.timestep for frame in subject.frames["train"]})
+    return {t: evaluation_pose(avatar, subject, t) for t in spread(timesteps, GEOMETRY_TIMESTEPS)}
 
 
 def _warn_of_cut_expression(avatar: Avatar, subject: Subject) -> None:
@@ -193,127 +219,3 @@ def _mean(scores: list[dict[str, float | None]], name: str) -> float | None:
     """Mean over the images that have this score."""
     values = [value for score in scores if (value := score[name]) is not None]
     return float(np.mean(values)) if values else None
-
-
-@torch.no_grad()
-def score_geometry(avatar: Avatar, subject: Subject) -> dict[str, Any] | None:
-    """Compare the fitted surface with the true one.
-
-    Distances run from the truth's vertices, ``mask_face`` of those that at least three training images see where the
-    truth says so, to the fitted surface, at up to twelve training timesteps.
-
-    Args:
-        avatar: The avatar.
-        subject: The capture; ``ground_truth`` has ``vertices`` [T, V, 3] by the capture's own timestep numbers,
-            ``faces``, and optionally ``mask_*`` and ``seen``.
-
-    Returns:
-        ``mean_mm``, ``median_mm`` and ``p95_mm`` of the distances; ``normal_deg``, the mean angle between normals;
-        ``flipped_faces``, how many faces of the fitted head look against their direction in the parametric one;
-        ``regions``, the mean distance [mm] of every mask, None where nothing of it is seen. None without truth.
-
-    Raises:
-        DataError: If the file of the truth is damaged or does not fit the capture.
-    """
-    if subject.ground_truth is None:
-        return None
-    truth = Truth.read(subject.ground_truth, subject)
-    head = avatar.head
-    faces = head.body.faces
-    timesteps = sorted({frame.timestep for frame in subject.frames["train"]})
-    distances, angles = [], []
-    for timestep in spread(timesteps, GEOMETRY_TIMESTEPS):
-        verts = avatar.verts(evaluation_pose(avatar, subject, timestep))
-        points = torch.tensor(truth.vertices[subject.timestep_ids[timestep]])
-        distance, angle = _compare(verts, faces, points, truth.faces)
-        distances.append(distance)
-        angles.append(angle)
-    distance_mm, angle_deg = 1e3 * np.stack(distances), np.degrees(np.stack(angles))
-    chosen = distance_mm[:, truth.scored]
-    return {
-        "mean_mm": _finite_mean(chosen),
-        "median_mm": float(np.nanmedian(chosen)),
-        "p95_mm": float(np.nanpercentile(chosen, 95)),
-        "normal_deg": _finite_mean(angle_deg[:, truth.scored]),
-        "flipped_faces": _flipped_faces(head.canonical(), head.body.shaped(head.betas), faces),
-        "regions": {name: _finite_mean(distance_mm[:, region]) for name, region in truth.regions.items()},
-    }
-
-
-def _finite_mean(values: np.ndarray) -> float | None:
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if finite.size else None
-
-
-class Truth:
-    """``ground_truth/*.npz``, checked."""
-
-    def __init__(self, vertices: np.ndarray, faces: Tensor, seen: np.ndarray, masks: dict[str, np.ndarray]) -> None:
-        self.vertices, self.faces = vertices, faces
-        self.regions = {name: mask & seen for name, mask in masks.items()}
-        self.scored = self.regions.get("face", seen)
-
-    @staticmethod
-    def read(path: Path, subject: Subject) -> Truth:
-        arrays = read_npz(
-            path, wanted=lambda key: key in ("vertices", "faces", "seen") or key.startswith("mask_")
-        ).arrays
-        if not {"vertices", "faces"} <= set(arrays):
-            raise DataError(f"{path}: needs vertices (T, V, 3) and faces (F, 3)")
-        vertices, faces = float_array(arrays["vertices"], where=f"{path}: vertices"), arrays["faces"]
-        if vertices.ndim != 3 or vertices.shape[2] != 3 or len(vertices) <= max(subject.timestep_ids):
-            raise DataError(
-                f"{path}: vertices has shape {vertices.shape}; a row of (V, 3) is needed for each timestep up to "
-                f"{max(subject.timestep_ids)}"
-            )
-        n_verts = vertices.shape[1]
-        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu" or not _within(faces, n_verts):
-            raise DataError(f"{path}: faces must be (F, 3) indices of its {n_verts} vertices")
-        for name, values in arrays.items():
-            if name not in ("vertices", "faces") and (values.shape != (n_verts,) or values.dtype.kind not in "biuf"):
-                raise DataError(f"{path}: {name} has shape {values.shape}, one value for each of {n_verts} is needed")
-        seen = arrays["seen"] >= 3 if "seen" in arrays else np.ones(n_verts, bool)
-        masks = {
-            name.removeprefix("mask_"): arrays[name].astype(bool) for name in sorted(arrays) if name[:5] == "mask_"
-        }
-        truth = Truth(vertices, torch.tensor(faces.astype(np.int64)), seen, masks)
-        if not truth.scored.any():
-            raise DataError(f"{path}: mask_face and seen leave no vertex to score")
-        return truth
-
-
-def _within(faces: np.ndarray, n_verts: int) -> bool:
-    return faces.size > 0 and 0 <= int(faces.min()) <= int(faces.max()) < n_verts
-
-
-def _compare(verts: Tensor, faces: Tensor, points: Tensor, point_faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [m] from points to a mesh and angles [rad] between the normals there; NaN where there is none."""
-    truth_normals = vertex_normals(points, point_faces).to(verts.device)
-    points = points.to(verts.device)
-    closest, face_ids = closest_points(verts, faces, points, reach=REACH)
-    found = face_ids >= 0
-    distance = (closest - points).norm(dim=1).where(found, torch.nan)
-    normals = face_normals(verts, faces)[face_ids.clamp(min=0).long()]
-    known = found & (normals.norm(dim=1) > 0.5) & (truth_normals.norm(dim=1) > 0.5)
-    angle = torch.acos((normals * truth_normals).sum(1).clamp(-1.0, 1.0)).where(known, torch.nan)
-    return distance.cpu().numpy(), angle.cpu().numpy()
-
-
-def face_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals of faces, shape [F, 3]; zero where a face has no area."""
-    a, b, c = verts[faces.long()].unbind(1)
-    return torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=1), dim=1, eps=1e-30)
-
-
-def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """Unit normals of vertices, areas as weights, shape [V, 3]; zero where a vertex has no face."""
-    a, b, c = verts[faces].unbind(1)
-    doubled = torch.cross(b - a, c - a, dim=1)
-    total = torch.zeros_like(verts)
-    for corner in range(3):
-        total.index_add_(0, faces[:, corner], doubled)
-    return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
-
-
-def _flipped_faces(verts: Tensor, reference: Tensor, faces: Tensor) -> int:
-    return int(((face_normals(verts, faces) * face_normals(reference, faces)).sum(1) < 0).sum())

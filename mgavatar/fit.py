@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any, Protocol
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar, CaptureInfo, build_appearance
+from mgavatar.budget import Budget, Pace, TooShort, duration, geometry_share
 from mgavatar.camera import Camera
 from mgavatar.capture.images import read_images, read_masks
 from mgavatar.capture.subject import Subject
@@ -25,23 +28,28 @@ from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.stage import GeometryStage, VertexGaussians
-from mgavatar.head.body import FINE_ENOUGH, Body
+from mgavatar.head.body import Body
 from mgavatar.head.model import HeadModel
+from mgavatar.plan import plan
 from mgavatar.progress import MetricsLog, Reporter
+from mgavatar.summary import Summary
 
-FINE_EDGE = 4.0
-"""An edge of so few pixels [px] is not worth splitting."""
+_CLOSE = 1e-6
+"""A schedule is over when less of it is left, in iterations."""
 
 log = logging.getLogger("mgavatar")
 
 
 class Stage(Protocol):
-    """What the loop needs of a stage."""
+    """What the loop needs of a stage: its schedule has ``iterations``, and it is at ``position`` of them."""
 
     name: str
     iterations: int
+    position: float
 
-    def step(self, camera: Camera, timestep: int, target: Tensor, background: Tensor) -> dict[str, float]: ...
+    def step(
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+    ) -> dict[str, float]: ...
 
     def state_dict(self) -> dict[str, Any]: ...
 
@@ -155,39 +163,45 @@ def fit(
     device: torch.device,
     seed: int = 0,
     resume: bool = False,
+    budget: Budget | None = None,
 ) -> Avatar:
     """Fit an avatar (Section 3): geometry first, then, with the mesh frozen, appearance.
 
-    Writes ``config.toml``, ``metrics.jsonl``, ``checkpoint.pt`` and the avatar into the run's folder. A checkpoint is
-    written every few minutes and when the user interrupts; ``resume`` goes on from it bit for bit.
+    Writes ``config.toml``, ``metrics.jsonl``, ``checkpoint.pt``, ``summary.json`` and the avatar into the run's folder.
+    A checkpoint is written every few minutes and when the user interrupts; ``resume`` goes on from it bit for bit. With
+    a ``budget`` the schedules of both stages are made as long as its time allows, and what is left of it when resumed.
 
     Raises:
+        TooShort: If the budget does not allow even the least number of iterations.
         Interrupted: After Ctrl-C; the avatar as far as it came has been saved.
     """
     torch.manual_seed(seed)
-    config = with_subdivisions(config, head_model, subject)
-    checkpoint = _read_checkpoint(run, config, seed) if resume else None
-    run.folder.mkdir(parents=True, exist_ok=True)
-    if checkpoint is None:
-        (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+    config, decisions = plan(config, head_model, subject)
+    for decision in decisions:
+        log.info("plan: %s", decision)
+    checkpoint, budget = _opened(run, config, seed, budget, resume=resume)
+    summary = Summary(checkpoint["summary"] if checkpoint else None)
     capture = CaptureInfo.of(subject)
     metrics = MetricsLog(run.metrics)
-    loop = _Loop(config, run, metrics, torch.tensor(subject.background, device=device), seed)
+    background = torch.tensor(subject.background, device=device)
+    loop = _Loop(config, run, metrics, background, seed, summary, budget, fresh=checkpoint is None)
     body = Body(head_model, subdivisions=config.geometry.subdivisions, device=device)
     head = PersonalHead(body, subject.params, config.geometry)
     vertex_gaussians = VertexGaussians(head, config)
+    finished: dict[str, Any] = {}
     try:
-        geometry = GeometryStage(vertex_gaussians, config)
-        if checkpoint is not None:
-            _restore(geometry, checkpoint, run)
-        loop.run_stage(
-            geometry,
-            Views.of(subject, config.geometry.max_image_size, with_masks=config.random_background),
-            Avatar(vertex_gaussians, None, capture, config),
-            done=_done(checkpoint, geometry),
-            state=lambda: {"geometry": geometry.state_dict()},
-        )
-        finished = geometry.state_dict()
+        if config.geometry.enabled:
+            geometry = GeometryStage(vertex_gaussians, config)
+            if checkpoint is not None:
+                _restore(geometry, checkpoint, run)
+            loop.run_stage(
+                geometry,
+                lambda: Views.of(subject, config.geometry.max_image_size, with_masks=config.random_background),
+                Avatar(vertex_gaussians, None, capture, config),
+                done=_done(checkpoint, geometry),
+                state=lambda: {"geometry": geometry.state_dict()},
+            )
+            finished = {"geometry": geometry.state_dict()}
 
         appearance = build_appearance(head, config, seed=seed)
         stage = AppearanceStage(appearance, config, seed=seed)
@@ -196,41 +210,57 @@ def fit(
         avatar = Avatar(vertex_gaussians, appearance, capture, config)
         loop.run_stage(
             stage,
-            Views.of(subject, config.appearance.max_image_size, with_masks=config.random_background),
+            lambda: Views.of(subject, config.appearance.max_image_size, with_masks=config.random_background),
             avatar,
             done=_done(checkpoint, stage),
-            state=lambda: {"geometry": finished, "appearance": stage.state_dict()},
+            state=lambda: finished | {"appearance": stage.state_dict()},
         )
+    except TooShort:
+        for path in (run.folder / "config.toml", run.metrics, run.checkpoint):
+            path.unlink(missing_ok=True)  # nothing is lost, and --out is free for a longer fit
+        raise
     finally:
         metrics.close()
     avatar.save(run.avatar)
+    if budget is not None:
+        log.info("budget %s: used %.0f s: %s", duration(budget.seconds), budget.used, summary.told())
+    summary.write(
+        run.folder / "summary.json",
+        gaussians=avatar.n_gaussians,
+        parameters=_n_learned(avatar),
+        budget_seconds=budget.seconds if budget is not None else None,
+        plan=[dataclasses.asdict(decision) for decision in decisions],
+        seed=seed,
+        device=str(device),
+    )
     return avatar
 
 
-def with_subdivisions(config: FitConfig, head_model: HeadModel, subject: Subject) -> FitConfig:
-    """Settle ``auto``: the mesh that the images can show. The number goes into the avatar."""
-    if config.geometry.subdivisions != "auto":
-        return config
-    frame = subject.frames["train"][0]
-    camera = frame.camera
-    shrink = min(1.0, config.appearance.max_image_size / max(camera.width, camera.height))
-    verts, faces = head_model.v_template, head_model.faces
-    edge = float(np.linalg.norm(verts[faces] - verts[np.roll(faces, -1, axis=1)], axis=2).mean())
-    center = verts.mean(0) + subject.params.translation[frame.timestep]
-    depth = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
-    pixels = shrink * camera.K[0, 0] * edge / max(depth, 1e-6)
-    times = 1 if len(verts) < FINE_ENOUGH and pixels > FINE_EDGE else 0
-    log.info("%d subdivisions: %d vertices, edges of %.1f mm are %.1f px", times, len(verts), 1e3 * edge, pixels)
-    return replace(config, geometry=replace(config.geometry, subdivisions=times))
+def _opened(
+    run: Run, config: FitConfig, seed: int, budget: Budget | None, *, resume: bool
+) -> tuple[dict[str, Any] | None, Budget | None]:
+    """The checkpoint to go on from, if any, and what it has left of the budget; a new run's folder otherwise."""
+    if not resume:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+        return None, budget
+    checkpoint = _read_checkpoint(run, config, seed)
+    if budget is None and checkpoint["budget"] is not None:
+        budget = Budget(checkpoint["budget"])
+    if budget is not None:
+        budget.spent = checkpoint["used"]
+    return checkpoint, budget
 
 
 def _done(checkpoint: dict[str, Any] | None, stage: Stage) -> int:
-    """Iterations of a stage that a checkpoint holds."""
-    if checkpoint is None:
-        return 0
-    if checkpoint["stage"] == stage.name:
-        return int(checkpoint["iteration"])
-    return stage.iterations if stage.name == "geometry" else 0
+    """Iterations that a checkpoint holds of a stage that is not finished."""
+    return int(checkpoint["iteration"]) if checkpoint is not None and checkpoint["stage"] == stage.name else 0
+
+
+def _n_learned(avatar: Avatar) -> int:
+    """Learned numbers of an avatar."""
+    parts = [avatar.vertex_gaussians] + ([avatar.appearance] if avatar.appearance is not None else [])
+    return sum(parameter.numel() for part in parts for parameter in part.parameters())
 
 
 class _StopRequest:
@@ -260,49 +290,103 @@ class _Loop:
     log: MetricsLog
     background: Tensor
     seed: int
+    summary: Summary
+    budget: Budget | None
+    fresh: bool
 
     def run_stage(
-        self, stage: Stage, views: Views, avatar: Avatar, *, done: int, state: Callable[[], dict[str, Any]]
+        self,
+        stage: Stage,
+        read_views: Callable[[], Views],
+        avatar: Avatar,
+        *,
+        done: int,
+        state: Callable[[], dict[str, Any]],
     ) -> None:
         """Iterations ``done`` + 1 to the last; ``state`` is what a checkpoint holds besides its place."""
+        if _finished(stage):
+            return
+        views = read_views()
         order = iter(ViewOrder(len(views.images), self.seed))
         for _ in range(done):
             next(order)
-        started = saved = time.monotonic()
+        pace = self._pace(stage)
+        iteration, total = done, stage.iterations
+        started = noted = saved = time.monotonic()
         with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
-            for iteration in range(done + 1, stage.iterations + 1):
+            while not _finished(stage):
+                iteration += 1
+                advance = 1.0 if pace is None else pace.advance(stage.position)
                 view = next(order)
                 background = self._background(iteration) if views.masks is not None else self.background
                 target = views.target(view, self.background, background)
-                terms = stage.step(views.cameras[view], views.timesteps[view], target, background)
+                terms = stage.step(views.cameras[view], views.timesteps[view], target, background, advance)
                 if not np.isfinite(terms["loss"]):
                     raise DataError(
                         f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "
                         "lower the learning rates"
                     )
-                reporter.update(iteration, f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians")
+                total = iteration + math.ceil((stage.iterations - stage.position) / advance - _CLOSE)
+                if pace is not None and pace.just_known:
+                    self._tell_pace(stage, total, pace)
+                note = f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians"
+                reporter.update(iteration, note, total=total)
                 now = time.monotonic()
-                if iteration % self.config.log_every == 0 or iteration == stage.iterations:
+                if iteration % self.config.log_every == 0 or _finished(stage):
                     self.log.write(stage=stage.name, iteration=iteration, seconds=round(now - started, 3), **terms)
-                if now - saved > 60.0 * self.config.checkpoint_minutes or stop.requested:
+                if now - saved > 60.0 * self.config.checkpoint_minutes or stop.requested or _finished(stage):
+                    self.summary.stage(
+                        stage.name, iterations=iteration, configured=stage.iterations, seconds=now - noted
+                    )
                     self._save(stage, iteration, state)
-                    saved = now
+                    noted, saved = now, time.monotonic()
                 if stop.requested:
                     avatar.save(self.run.avatar)
-                    raise Interrupted(f"stopped in {stage.name} at {iteration}/{stage.iterations}")
-        if stage.iterations > done:
-            self._save(stage, stage.iterations, state)
+                    raise Interrupted(f"stopped in {stage.name} at {iteration}/{total}")
+
+    def _pace(self, stage: Stage) -> Pace | None:
+        if self.budget is None:
+            return None
+        first = stage.name == "geometry" or not self.config.geometry.enabled
+        share = geometry_share(stage.position / stage.iterations) if stage.name == "geometry" else 1.0
+        return self.budget.pace(stage.iterations, share=share, must_fit=first and self.fresh)
+
+    def _tell_pace(self, stage: Stage, total: int, pace: Pace) -> None:
+        """What the budget makes of a stage, once its pace is known."""
+        factor = total / stage.iterations
+        text = f"{stage.name} gets {pace.left:.0f} s more, about {total} of {stage.iterations} iterations"
+        if stage.name == "appearance":
+            c = self.config.appearance.density
+            start, stop, every = (round(factor * value) for value in (c.start, c.stop, c.every))
+            text += f"; density control from {start} to {stop}, every {every}"
+        if factor > 4.0:
+            text += f"; that is {factor:.1f} times the preset's: a larger preset makes more of so much time"
+        assert self.budget is not None  # noqa: S101  for the type checker
+        log.info("budget %s: %s", duration(self.budget.seconds), text)
 
     def _background(self, iteration: int) -> Tensor:
-        """The colour of an iteration; it depends on nothing else, so a resumed run sees the same."""
-        color = np.random.default_rng((self.seed, iteration)).random(3, dtype=np.float32)
-        return torch.from_numpy(color).to(self.background.device)
+        """A corner of the colour cube, the strongest contrasts, by the iteration alone: a resumed run sees the same."""
+        corner = np.random.default_rng((self.seed, iteration)).integers(0, 2, 3).astype(np.float32)
+        return torch.from_numpy(corner).to(self.background.device)
 
     def _save(self, stage: Stage, iteration: int, state: Callable[[], dict[str, Any]]) -> None:
-        checkpoint = {"stage": stage.name, "iteration": iteration, "config": to_toml(self.config), "seed": self.seed}
+        summary = self.summary.state()
+        checkpoint = {
+            "stage": stage.name,
+            "iteration": iteration,
+            "config": to_toml(self.config),
+            "seed": self.seed,
+            "budget": self.budget.seconds if self.budget is not None else None,
+            "used": self.budget.used if self.budget is not None else summary["seconds"],
+            "summary": summary,
+        }
         checkpoint |= state()
         with atomic_write(self.run.checkpoint) as file:
             torch.save(checkpoint, file)
+
+
+def _finished(stage: Stage) -> bool:
+    return stage.iterations - stage.position <= _CLOSE
 
 
 def _restore(stage: Stage, checkpoint: dict[str, Any], run: Run) -> None:
@@ -317,6 +401,7 @@ def _read_checkpoint(run: Run, config: FitConfig, seed: int) -> dict[str, Any]:
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
         stored, stored_seed = checkpoint["config"], checkpoint["seed"]
+        _ = checkpoint["summary"], checkpoint["budget"], checkpoint["used"]
     except Exception as error:
         raise DataError(f"{path}: not a checkpoint of `mgavatar fit`; remove the folder and start again") from error
     if stored != to_toml(config):

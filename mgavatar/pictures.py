@@ -14,8 +14,9 @@ from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, Subject
-from mgavatar.evaluate import evaluation_pose, spread, vertex_normals
-from mgavatar.head.body import Pose, fitted, pose_of
+from mgavatar.evaluate import evaluation_pose, spread
+from mgavatar.geometry_score import tracked_shape, vertex_normals
+from mgavatar.head.body import Pose, pose_of
 from mgavatar.kernels.ray_cast import RayMesh, camera_rays
 from mgavatar.render import turned_cameras
 from mgavatar.video import to_bytes
@@ -38,7 +39,7 @@ def comparison(avatar: Avatar, subject: Subject, frame: Frame) -> np.ndarray:
     pose = evaluation_pose(avatar, subject, frame.timestep)
     image = avatar.render(pose, frame.camera).image.clamp(0.0, 1.0).cpu()
     panels = (target, image, ERROR_GAIN * (image - target).abs())
-    return _beside([_at_most(to_bytes(panel), _PANEL_HEIGHT) for panel in panels])
+    return beside([at_most(to_bytes(panel), _PANEL_HEIGHT) for panel in panels])
 
 
 def mesh_comparison(avatar: Avatar, subject: Subject, truth: tuple[Tensor, Tensor] | None) -> np.ndarray:
@@ -60,7 +61,7 @@ def mesh_comparison(avatar: Avatar, subject: Subject, truth: tuple[Tensor, Tenso
         meshes.append((truth[0].to(avatar.device), truth[1].to(avatar.device, torch.int32)))
     view = _of_height(avatar.capture.mean_camera(), _PANEL_HEIGHT)
     views = turned_cameras(avatar, view, (0.0, SIDE_DEGREES))
-    rows = [_beside([normal_picture(*mesh, camera) for mesh in meshes]) for camera in views]
+    rows = [beside([normal_picture(*mesh, camera) for mesh in meshes]) for camera in views]
     gap = np.full((_GAP, rows[0].shape[1], 3), 255, np.uint8)
     return np.concatenate([rows[0], gap, rows[1]])
 
@@ -72,13 +73,9 @@ def first_timestep(subject: Subject) -> int:
 @torch.no_grad()
 def start_verts(avatar: Avatar, subject: Subject, timestep: int) -> Tensor:
     """Where the fit began: the parametric head in the tracked pose [m], shape [V, 3]."""
-    head, config = avatar.head, avatar.config.geometry
-    betas = torch.zeros_like(head.betas)
-    if config.start_from_tracked_shape:
-        betas += torch.from_numpy(fitted(avatar.capture.tracked.shape, len(betas))).to(betas)
-    shaped = head.body.shaped(betas)
+    body, shaped = avatar.head.body, tracked_shape(avatar)
     pose = pose_of(subject.params, timestep, avatar.head_model.n_expr).to(avatar.device)
-    return head.body.posed(shaped, pose, joints=head.body.joints(shaped))
+    return body.posed(shaped, pose, joints=avatar.head.joints(shaped))
 
 
 def normal_picture(verts: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
@@ -114,7 +111,7 @@ def strip(avatar: Avatar, subject: Subject, driving: Sequence[Pose] | None) -> n
     view = _of_height(avatar.capture.mean_camera(), _STRIP_HEIGHT)
     yaws = np.linspace(-30.0, 30.0, n_views) if n_views > 1 else [0.0]
     cameras = turned_cameras(avatar, view, yaws)
-    return _beside([to_bytes(avatar.render(pose, camera).image) for pose in poses for camera in cameras])
+    return beside([to_bytes(avatar.render(pose, camera).image) for pose in poses for camera in cameras])
 
 
 def _held_out_poses(avatar: Avatar, subject: Subject) -> list[Pose]:
@@ -129,14 +126,15 @@ def _of_height(camera: Camera, height: int) -> Camera:
     return camera.scaled(max(1, round(camera.width * height / camera.height)), height)
 
 
-def _at_most(pixels: np.ndarray, height: int) -> np.ndarray:
+def at_most(pixels: np.ndarray, height: int) -> np.ndarray:
+    """A picture, reduced to ``height`` [px] if it is higher."""
     if len(pixels) <= height:
         return pixels
     width = max(1, math.ceil(pixels.shape[1] * height / len(pixels)))
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.LANCZOS))
 
 
-def _beside(panels: Sequence[np.ndarray]) -> np.ndarray:
+def beside(panels: Sequence[np.ndarray]) -> np.ndarray:
     """Panels of one height in a row with white gaps."""
     gap = np.full((len(panels[0]), _GAP, 3), 255, np.uint8)
     row = [panels[0]]

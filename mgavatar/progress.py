@@ -43,12 +43,13 @@ class Reporter:
             seconds = time.monotonic() - self.started
             print(f"{self.title}: {self.total} done in {seconds:.0f} s", file=sys.stderr, flush=True)
 
-    def update(self, done: int, note: str = "") -> None:
-        """Say that ``done`` of the total are done."""
+    def update(self, done: int, note: str = "", *, total: int | None = None) -> None:
+        """Say that ``done`` of the total are done; a ``total`` takes the place of the one so far."""
+        self.total = self.total if total is None else total
         now = time.monotonic()
         rate = (done - self.first) / max(now - self.started, 1e-9)
         if self.live and self.task is not None:
-            self.live.update(self.task, completed=done, note=f"{rate:.1f}/s  {note}")
+            self.live.update(self.task, completed=done, total=self.total, note=f"{rate:.1f}/s  {note}")
         elif now - self.last >= _PLAIN_SECONDS:
             self.last = now
             left = (self.total - done) / max(rate, 1e-9)

@@ -149,7 +149,7 @@ def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translat
     """A point inside the head, between neck joint and eyes, in each of T poses [m], shape [T, 3]."""
     head = avatar.head
     with torch.no_grad():
-        joints = head.body.joints(head.canonical()).cpu().numpy().astype(np.float64)
+        joints = head.joints(head.canonical()).cpu().numpy().astype(np.float64)
     root, top = joints[0], joints[1]
     inside = (top + joints[3] + joints[4]) / 3.0
     turned = top + Rotation.from_rotvec(neck).apply(inside - top)

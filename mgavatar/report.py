@@ -24,14 +24,22 @@ from mgavatar.capture.subject import Split, Subject
 from mgavatar.charts import Line, loss_chart, read_history
 from mgavatar.config import FitConfig
 from mgavatar.driving import Driving
-from mgavatar.evaluate import Truth, spread
+from mgavatar.evaluate import spread
 from mgavatar.files import atomic_write
+from mgavatar.geometry_score import Truth
 from mgavatar.pictures import ERROR_GAIN, SIDE_DEGREES, comparison, first_timestep, mesh_comparison, strip
 from mgavatar.render import poses_of
 
 _LIBRARIES = ("torch", "warp-lang", "numpy", "scipy", "kornia", "Pillow")
 _TITLES: dict[str, str] = {"val": "Novel views (val)", "test": "Self-reenactment (test)", "train": "Training views"}
 _TRIVIAL = {"white": "white", "mean_image": "mean image", "nearest_frame": "nearest frame"}
+
+_STEPS = {
+    "start": "start, as tracked",
+    "beta": "identity and poses",
+    "identity_offsets": "+ identity offsets",
+    "pose_offsets": "+ pose offsets",
+}
 
 _STYLE = """
 :root { color-scheme: light dark; --bg: #fafaf9; --card: #fff; --text: #1c1c1a; --quiet: #66655f; --line: #dddcd6;
@@ -256,12 +264,32 @@ def _scores(metrics: dict[str, Any] | None) -> str:
 def _geometry(geometry: dict[str, Any] | None) -> str:
     if geometry is None:
         return '<p class="quiet">Geometry is not scored: the capture has no ground truth.</p>'
-    head = ["true surface to mesh", "mean [mm]", "median [mm]", "95th percentile [mm]", "normals [°]", "flipped faces"]
-    values = [_number(geometry[name], 2) for name in ("mean_mm", "median_mm", "p95_mm")]
-    row = ["scored region", *values, _number(geometry["normal_deg"], 1), str(geometry["flipped_faces"])]
-    regions = geometry.get("regions", {})
-    rows = [[name, _number(value, 2), "", "", "", ""] for name, value in regions.items()] if len(regions) > 1 else []
-    return _table(head, [row, *rows])
+    numbers = ["mean [mm]", "median [mm]", "95th percentile [mm]", "normals [°]"]
+    rows = [["scored region", *_distances(geometry)]]
+    rows += [[name, *_distances(scores)] for name, scores in geometry["regions"].items()]
+    steps = [[_STEPS[name], *_distances(scores), *_folds(scores)] for name, scores in geometry["steps"].items()]
+    steps.append(["neutral head", "", "", "", "", *_folds(geometry)])
+    folds = ["flipped faces", "faces that cross", "new crossings"]
+    note = (
+        '<p class="quiet">Above by region, below the scored region at each point of the construction. Faces cross in '
+        "the parametric head too, at teeth and eyes; new crossings are those that it does not have. Pose offsets are "
+        "counted in their worst pose.</p>"
+    )
+    return (
+        _table(["true surface to mesh", *numbers], rows) + note + _table(["point of the fit", *numbers, *folds], steps)
+    )
+
+
+def _distances(scores: dict[str, Any]) -> list[str]:
+    return [
+        *(_number(scores[name], 2) for name in ("mean_mm", "median_mm", "p95_mm")),
+        _number(scores["normal_deg"], 1),
+    ]
+
+
+def _folds(scores: dict[str, Any]) -> list[str]:
+    pairs = scores["self_intersections"]
+    return [str(scores["flipped_faces"]), str(pairs["fitted"]), str(pairs["added"])]
 
 
 def _losses(stages: dict[str, list[Line]]) -> str:

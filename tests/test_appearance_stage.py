@@ -16,7 +16,7 @@ from torch import Tensor
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, face_uvs
 from mgavatar.appearance.model import Appearance, PosedMesh
-from mgavatar.appearance.offset_net import N_THETA, OffsetNet, Offsets
+from mgavatar.appearance.offset_net import N_THETA, OffsetNet
 from mgavatar.appearance.stage import AppearanceStage, binding_loss
 from mgavatar.avatar import build_appearance
 from mgavatar.camera import Camera
@@ -147,16 +147,6 @@ def test_offset_net_sees_all_of_its_inputs():
         assert not torch.allclose(net(*inputs), before)
 
 
-def test_the_channels_of_the_offset_maps():
-    """Position, colour, rotation, scale, opacity, in this order."""
-    offsets = Offsets.of(torch.arange(26.0).reshape(2, 13))
-    assert offsets.means[0].tolist() == [0, 1, 2]
-    assert offsets.colors[0].tolist() == [3, 4, 5]
-    assert offsets.rotations[0].tolist() == [6, 7, 8]
-    assert offsets.log_scales[0].tolist() == [9, 10, 11]
-    assert offsets.opacity_logits.tolist() == [12, 25]
-
-
 def test_offsets_change_what_they_say(subject, views):
     """A constant offset map moves, colours, turns, scales and fades every Gaussian by its channels."""
     appearance = make_appearance(subject)
@@ -203,7 +193,7 @@ def test_offsets_are_read_where_the_gaussian_sits_in_the_atlas(subject):
     appearance.offset_net = Maps()
     _, offsets = appearance._offsets(frozen.at_timestep(0))
     inside = ((centres > 1 / 64) & (centres < 1 - 1 / 64)).all(1)
-    assert torch.allclose(offsets.means[inside, :2], centres[inside], atol=1e-5)
+    assert torch.allclose(offsets[inside, :2], centres[inside], atol=1e-5)
 
 
 def test_texture_coordinates_follow_a_gaussian_over_its_face():

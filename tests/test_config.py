@@ -13,7 +13,7 @@ from torch import nn
 
 from mgavatar import cli
 from mgavatar.appearance.color_net import ColorNet
-from mgavatar.appearance.offset_net import N_OFFSETS, OffsetNet
+from mgavatar.appearance.offset_net import OffsetNet
 from mgavatar.config import (
     ACCURACY,
     AppearanceConfig,
@@ -33,6 +33,7 @@ from mgavatar.errors import DataError
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
 from mgavatar.head.procedural import build_head
+from mgavatar.kernels.face_bound import N_OFFSETS
 
 PAPER = {
     "random_background": False,
@@ -180,8 +181,31 @@ def test_switches_and_choices_come_through_a_file(tmp_path, monkeypatch):
     assert config.geometry.subdivisions == 0
     assert config.appearance.color_net.view_frame == "world"
     assert config.appearance.offset_net.enabled is False
-    assert parsed(monkeypatch, "--preset", str(path), "--geometry.pose-offsets").geometry.pose_offsets is True
+    chosen = parsed(monkeypatch, "--preset", str(path), "--geometry.pose-offsets", "true")
+    assert chosen.geometry.pose_offsets is True
     assert parsed(monkeypatch, "--preset", "paper").geometry.subdivisions == "auto"
+
+
+def test_what_the_plan_may_decide_comes_as_flag_and_as_file(tmp_path, monkeypatch):
+    """``auto`` beside true, false and numbers, either way; a switch without ``auto`` stays a switch."""
+    settled = FitConfig(
+        geometry=GeometryConfig(pose_offsets="auto", learn_jaw=False, learn_eyes="auto", subdivisions="auto"),
+        appearance=AppearanceConfig(
+            colors="auto",
+            color_net=ColorNetConfig(levels="auto", max_resolution="auto", view_frame="auto"),
+            offset_net=OffsetNetConfig(enabled="auto", resolution=64),
+        ),
+    )
+    path = tmp_path / "config.toml"
+    path.write_text(to_toml(settled))
+    assert 'pose_offsets = "auto"\nlearn_jaw = false\n' in path.read_text()
+    assert parsed(monkeypatch, "--preset", str(path)) == settled
+    flags = ["--geometry.learn-jaw=auto", "--appearance.offset-net.enabled", "true", "--geometry.no-enabled"]
+    config = parsed(monkeypatch, "--preset", str(path), *flags, "--appearance.color-net.levels=3")
+    assert (config.geometry.learn_jaw, config.geometry.enabled) == ("auto", False)
+    assert (config.appearance.offset_net.enabled, config.appearance.color_net.levels) == (True, 3)
+    assert from_dict(dataclasses.asdict(config)) == config
+    check(settled)
 
 
 def test_an_unknown_key_is_refused_with_a_suggestion(tmp_path, monkeypatch, capsys):
@@ -288,6 +312,7 @@ def test_a_preset_that_cannot_be_read(preset, text, words, tmp_path, monkeypatch
         ("appearance.offset_net", "resolution", 8, "--appearance.offset-net.resolution"),
         ("appearance.offset_net", "resolution", 60, "multiple of 8"),
         ("appearance.density", "every", 0, "--appearance.density.every"),
+        ("appearance.sh", "degree", 4, "--appearance.sh.degree"),
         ("raster", "alpha_threshold", -0.1, "--raster.alpha-threshold"),
         ("raster", "stop", 0.6, "--raster.stop"),
         ("raster", "accuracy", "perfect", "--raster.accuracy"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import pytest
@@ -261,6 +262,16 @@ def test_refining_forgets_what_was_collected():
 def test_when_it_is_due():
     """Every so often between start and stop, both included."""
     density = Scene(start=10, stop=30, every=10).density
-    assert [i for i in range(50) if density.due(i)] == [10, 20, 30]
+    assert [i for i in range(50) if density.due(i - 1, i)] == [10, 20, 30]
     density = Scene(start=11, stop=39, every=10).density
-    assert [i for i in range(50) if density.due(i)] == [20, 30]
+    assert [i for i in range(50) if density.due(i - 1, i)] == [20, 30]
+
+
+def test_when_it_is_due_in_a_schedule_of_another_length():
+    """Each round once, at the first step that reaches it, whether steps are a quarter or several iterations long."""
+    density = Scene(start=10, stop=30, every=10).density
+    for step in (0.25, 0.3, 0.99, 3.7, 7.0):
+        places = [step * i for i in range(int(50 / step) + 1)]
+        due = [now for before, now in itertools.pairwise(places) if density.due(before, now)]
+        assert [now // 10 * 10 for now in due] == [10, 20, 30]
+        assert all(now % 10 < step + 1e-9 for now in due)

@@ -18,7 +18,7 @@ from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Subject
 from mgavatar.capture.vhap import read_capture
 from mgavatar.errors import DataError
-from mgavatar.evaluate import evaluate, evaluate_sample, score_geometry, write_metrics
+from mgavatar.evaluate import evaluate, evaluate_sample, write_metrics
 from mgavatar.head.body import Pose
 from mgavatar.kernels.rasterize import Rendering
 from mgavatar.losses import ssim
@@ -127,6 +127,41 @@ def test_samples_and_missing_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "nearest_frame" not in metrics["splits"]["train"]["trivial"]
 
 
+def test_training_images_are_never_scored(
+    pair: tuple[Avatar, Subject], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The same camera and timestep, or the same file, is left out and said; with nothing left there is no score."""
+    avatar, subject = pair
+    _fake_renderer(avatar, monkeypatch)
+    train, test = subject.frames["train"], subject.frames["test"]
+    same_place = replace(test[0], camera_id=train[0].camera_id, timestep=train[0].timestep)
+    detour = train[1].image_path.parent / ".." / "images" / train[1].image_path.name
+    same_file = replace(test[0], image_path=detour)
+    mixed = replace(subject, frames={**subject.frames, "test": (same_place, *test, same_file)})
+    metrics = evaluate(avatar, mixed, avatar_path=Path("a.pt"), splits=("val", "test"), max_frames=2)
+    assert (metrics["splits"]["test"]["frames"], metrics["splits"]["test"]["sampled_from"]) == (2, len(test))
+    assert caplog.text.count("not scored") == 1
+    assert "2 images of test are training images and not scored" in caplog.text
+    clean = evaluate(avatar, subject, avatar_path=Path("a.pt"), splits=("test",))["splits"]["test"]
+    assert evaluate(avatar, mixed, avatar_path=Path("a.pt"), splits=("test",))["splits"]["test"] == clean
+    leaked = replace(subject, frames={**subject.frames, "test": (same_place, same_file)})
+    with pytest.raises(DataError, match="every image in test is a training image"):
+        evaluate(avatar, leaked, avatar_path=Path("a.pt"), splits=("test",))
+    assert evaluate(avatar, leaked, avatar_path=Path("a.pt"), splits=("val", "test"))["splits"].keys() == {"val"}
+    nothing = replace(leaked, frames={**leaked.frames, "val": ()})
+    assert evaluate_sample(avatar, nothing, avatar_path=Path("a.pt"))["splits"].keys() == {"train"}
+
+
+def test_the_splits_of_the_real_capture_do_not_overlap(real_data: Path) -> None:
+    """Neither by camera and timestep, nor by file, nor by what is in the files."""
+    frames = read_capture(real_data / "subjects/lps_multiview").frames
+    every = [frame for split in frames.values() for frame in split]
+    assert len({(frame.camera_id, frame.timestep) for frame in every}) == len(every)
+    assert len({frame.image_path.resolve() for frame in every}) == len(every)
+    contents = {split: {frame.image_path.read_bytes() for frame in own} for split, own in frames.items()}
+    assert not contents["train"] & (contents["val"] | contents["test"])
+
+
 def test_metrics_file(tmp_path: Path) -> None:
     write_metrics(tmp_path / "metrics.json", {"a": [1.5, None]})
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"a": [1.5, None]}
@@ -174,91 +209,6 @@ def test_trivial_predictors_on_real_data(real_data: Path) -> None:
         scores = [trivial.scores(frame, read_images([frame])[0].float() / 255.0) for frame in frames]
         means = [np.mean([score[name] for score in scores]) for name in ("white", "mean_image", "nearest_frame")]
         assert means == pytest.approx(expected, abs=0.006)
-
-
-def _with_truth(avatar: Avatar, subject: Subject, path: Path, *, out: float = 0.001, **more: np.ndarray) -> Subject:
-    """The capture with the avatar's own surface, moved ``out`` along its normals [m], as its truth."""
-    verts = []
-    for t in range(len(subject.params)):
-        posed = avatar.verts(avatar.head.pose(t))
-        verts.append((posed + out * avatar.head.body.normals(posed)).numpy())
-    np.savez(path, **{"vertices": np.stack(verts), "faces": avatar.head.body.faces.numpy(), **more})
-    return replace(subject, ground_truth=path)
-
-
-def test_geometry_of_a_known_offset(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
-    """A truth one millimetre outside a convex mesh is one millimetre away from it."""
-    avatar, subject = pair
-    score = score_geometry(avatar, _with_truth(avatar, subject, tmp_path / "truth.npz"))
-    assert score is not None
-    assert set(score) == {"mean_mm", "median_mm", "p95_mm", "normal_deg", "flipped_faces", "regions"}
-    for name in ("mean_mm", "median_mm", "p95_mm"):
-        assert score[name] == pytest.approx(1.0, abs=1e-3)
-    assert 1.0 < score["normal_deg"] < 30.0  # between a ball of 80 faces and its vertices' normals
-    assert score["flipped_faces"] == 0
-    assert score["regions"] == {}
-    inside_out = avatar.head.body.faces.numpy()[:, ::-1]
-    turned = score_geometry(avatar, _with_truth(avatar, subject, tmp_path / "turned.npz", faces=inside_out))
-    assert turned is not None
-    assert turned["normal_deg"] == pytest.approx(180.0 - score["normal_deg"], abs=0.01)
-
-
-def test_geometry_of_regions_that_are_seen(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
-    """The face is scored where three images see it; every mask gets its own mean."""
-    avatar, subject = pair
-    n = avatar.head.body.n_verts
-    rng = np.random.default_rng(0)
-    face, seen = rng.random(n) < 0.5, rng.integers(0, 6, n)
-    base = _with_truth(avatar, subject, tmp_path / "base.npz").ground_truth
-    assert base is not None
-    vertices = np.load(base)["vertices"]
-    center = vertices.mean(axis=1, keepdims=True)
-    away = np.where((face & (seen >= 3))[:, None], vertices, vertices + 0.05 * (vertices - center))
-    masks = {"mask_face": face, "mask_rest": ~face, "mask_hidden": seen < 3, "seen": seen}
-    chosen = _with_truth(avatar, subject, tmp_path / "truth.npz", vertices=away.astype(np.float32), **masks)
-    score = score_geometry(avatar, chosen)
-    assert score is not None
-    assert score["mean_mm"] == pytest.approx(1.0, abs=1e-3)
-    assert score["regions"]["face"] == pytest.approx(1.0, abs=1e-3)
-    assert score["regions"]["rest"] > 3.0
-    assert score["regions"]["hidden"] is None
-
-
-def test_flipped_faces_are_counted(
-    pair: tuple[Avatar, Subject], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A fitted head that is the mirror image of its template: faces whose normal is mostly along y and z turn over."""
-    avatar, subject = pair
-    shaped = avatar.head.body.shaped(avatar.head.betas)
-    subject = _with_truth(avatar, subject, tmp_path / "truth.npz")
-    monkeypatch.setattr(avatar.head, "canonical", lambda: shaped * torch.tensor([-1.0, 1.0, 1.0]))
-    a, b, c = shaped.numpy()[avatar.head.body.faces.numpy()].transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    expected = int((normals[:, 0] ** 2 < normals[:, 1] ** 2 + normals[:, 2] ** 2).sum())
-    score = score_geometry(avatar, subject)
-    assert score is not None
-    assert 0 < expected < len(normals)
-    assert score["flipped_faces"] == expected
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"vertices": np.zeros((2, 5, 3), np.float32)}, "a row of (V, 3) is needed for each timestep up to 3"),
-        ({"vertices": np.full((4, 42, 3), np.nan, np.float32)}, "NaN or infinite"),
-        ({"faces": np.array([[0, 1, 42]])}, "faces must be (F, 3) indices of its 42 vertices"),
-        ({"seen": np.zeros(3)}, "seen has shape (3,)"),
-        ({"seen": np.zeros(42)}, "leave no vertex to score"),
-    ],
-)
-def test_damaged_truths_are_refused(
-    pair: tuple[Avatar, Subject], tmp_path: Path, more: dict[str, np.ndarray], message: str
-) -> None:
-    avatar, subject = pair
-    damaged = _with_truth(avatar, subject, tmp_path / "truth.npz", **more)
-    with pytest.raises(DataError, match=r"truth\.npz") as caught:
-        score_geometry(avatar, damaged)
-    assert message in str(caught.value)
 
 
 @pytest.fixture(scope="module")

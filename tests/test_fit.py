@@ -24,8 +24,9 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, from_dict
 from mgavatar.errors import DataError
-from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run, with_subdivisions
+from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run
 from mgavatar.geometry.stage import GeometryStage
+from mgavatar.plan import plan
 
 STAGES = {"geometry": GeometryStage, "appearance": AppearanceStage}
 
@@ -133,21 +134,82 @@ def test_a_fit_leaves_a_usable_avatar(whole, subject):
 def test_what_is_in_the_folder(whole, subject):
     """Configuration, log, checkpoint and avatar; nothing half-written."""
     names = sorted(path.name for path in whole.folder.iterdir())
-    assert names == ["avatar.pt", "checkpoint.pt", "config.toml", "metrics.jsonl"]
-    settled = with_subdivisions(tiny_config(), tiny_head(), subject)
+    assert names == ["avatar.pt", "checkpoint.pt", "config.toml", "metrics.jsonl", "summary.json"]
+    settled, _ = plan(tiny_config(), tiny_head(), subject)
     assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text())) == settled
 
 
-@pytest.mark.parametrize(("zoom", "size", "times"), [(1.0, 8192, 1), (0.01, 8192, 0), (1.0, 16, 0)])
-def test_subdivision_goes_by_what_the_images_show(subject, zoom, size, times):
-    """A coarse head is subdivided where its edges are long in the images that the fit will see, and not otherwise."""
-    frame = subject.frames["train"][0]
-    near = replace(frame.camera, K=frame.camera.K * np.array([[zoom], [zoom], [1.0]]))
-    seen = replace(subject, frames={**subject.frames, "train": (replace(frame, camera=near),)})
-    auto = tiny_config(geometry={"subdivisions": "auto"}, appearance={"max_image_size": size})
-    assert with_subdivisions(auto, tiny_head(), seen).geometry.subdivisions == times
-    fixed = tiny_config(geometry={"subdivisions": 2})
-    assert with_subdivisions(fixed, tiny_head(), seen) is fixed
+def test_what_the_fit_took(whole):
+    """``summary.json``: time, iterations, memory and size, and why the fit was done as it was."""
+    summary = json.loads((whole.folder / "summary.json").read_text())
+    avatar = Avatar.load(whole.avatar)
+    assert avatar.appearance is not None
+    assert summary["gaussians"] == avatar.n_gaussians
+    parts = (avatar.vertex_gaussians, avatar.appearance)
+    assert summary["parameters"] == sum(value.numel() for part in parts for value in part.parameters())
+    assert list(summary["stages"]) == ["geometry", "appearance"]
+    for stage in summary["stages"].values():
+        assert stage["iterations"] == stage["configured"] == 12
+        assert stage["seconds"] > 0
+    assert summary["seconds"] > sum(stage["seconds"] for stage in summary["stages"].values())
+    assert 50 < summary["peak_mib"] < 50_000
+    assert (summary["seed"], summary["device"], summary["budget_seconds"]) == (0, "cpu", None)
+    (decision,) = summary["plan"]
+    assert (decision["key"], decision["value"]) == ("geometry.subdivisions", 1)
+    assert "edges of" in decision["reason"]
+
+
+def test_interrupted_and_resumed_the_summary_adds_up(subject, tmp_path, monkeypatch):
+    """Both parts of a stage count; a fit that was interrupted has no summary yet."""
+    with at_step(monkeypatch, "appearance", 5, press_ctrl_c), pytest.raises(Interrupted):
+        fit_into(tmp_path / "run", subject)
+    assert not (tmp_path / "run" / "summary.json").exists()
+    before = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["summary"]
+    assert before["stages"]["appearance"]["iterations"] == 5
+    run = fit_into(tmp_path / "run", subject, resume=True)
+    after = json.loads((run.folder / "summary.json").read_text())
+    assert after["stages"]["geometry"] == before["stages"]["geometry"]
+    assert after["stages"]["appearance"]["iterations"] == 12
+    for one, other in ((before["stages"]["appearance"], after["stages"]["appearance"]), (before, after)):
+        assert other["seconds"] > one["seconds"] > 0
+
+
+def test_a_fit_plans_first(subject, tmp_path, caplog):
+    """With everything left open, all decisions are said, and neither avatar nor run stores an ``auto``."""
+    config = tiny_config(geometry={"pose_offsets": "auto", "learn_jaw": "auto", "learn_eyes": "auto"})
+    nets = {
+        "color_net": replace(config.appearance.color_net, levels="auto", max_resolution="auto", view_frame="auto"),
+        "offset_net": replace(config.appearance.offset_net, enabled="auto", resolution="auto"),
+    }
+    config = replace(config, appearance=replace(config.appearance, colors="auto", **nets))
+    with caplog.at_level("INFO", logger="mgavatar"):
+        run = fit_into(tmp_path / "run", subject, config=config)
+    said = [record.message for record in caplog.records if record.message.startswith("plan: ")]
+    assert len(said) == 10
+    assert "auto" not in (run.folder / "config.toml").read_text()
+    avatar = Avatar.load(run.avatar)
+    assert plan(config, tiny_head(), subject)[0] == avatar.config
+    assert len(json.loads((run.folder / "summary.json").read_text())["plan"]) == 10
+
+
+def test_without_a_geometry_stage(subject, tmp_path):
+    """The appearance is learned on the mesh as tracked."""
+    run = fit_into(tmp_path / "run", subject, config=tiny_config(geometry={"enabled": False}))
+    assert {line["stage"] for line in log_lines(run)} == {"appearance"}
+    head = Avatar.load(run.avatar).head
+    n = head.body.model.n_shape
+    assert np.array_equal(head.betas.numpy(), subject.params.shape[:n])
+    assert np.allclose(head.poses["jaw"].numpy(), subject.params.jaw_pose)
+    assert torch.equal(head.canonical(), head.body.shaped(head.betas))
+
+
+def test_without_a_geometry_stage_a_fit_resumes_too(subject, tmp_path, monkeypatch):
+    """To the same bits."""
+    config = tiny_config(geometry={"enabled": False})
+    whole = fit_into(tmp_path / "whole", subject, config=config)
+    with at_step(monkeypatch, "appearance", 5, press_ctrl_c), pytest.raises(Interrupted):
+        fit_into(tmp_path / "run", subject, config=config)
+    assert differing(whole, fit_into(tmp_path / "run", subject, config=config, resume=True)) == []
 
 
 def test_the_log(whole):

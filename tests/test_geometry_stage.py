@@ -189,6 +189,21 @@ def test_gaussians_are_drawn_behind_the_surface(subject):
     assert (moved * inwards).sum(1).min() > 0
 
 
+def test_the_shift_is_in_sigmas_as_the_camera_sees_them(subject, views):
+    """In an image of a quarter of the size a pixel is four times as large, and so is its share of the blur."""
+    gaussians = make_stage(subject, tiny_config(geometry={"surface_shift": 1.5})).gaussians
+    posed = gaussians.head.posed(gaussians.head.pose(0))
+    sigmas, camera = gaussians.scales(posed).double(), views.cameras[0]
+    depths = (posed.verts.double() @ torch.tensor(camera.viewmat[:3, :3]).T + torch.tensor(camera.viewmat[:3, 3]))[:, 2]
+    for factor in (1, 4):
+        smaller = camera.scaled(camera.width // factor, camera.height // factor)
+        pixels = depths / smaller.K[0, 0]
+        expected = 1.5 * (sigmas**2 + 0.3 * pixels**2).sqrt()
+        moved = gaussians.bound(posed, smaller).means - posed.verts
+        assert torch.allclose(moved.norm(dim=1).double(), expected, rtol=1e-3)
+        assert expected.mean() > 1.05 * 1.5 * sigmas.mean() * factor**0.5
+
+
 @pytest.mark.parametrize("follow", [False, True])
 def test_scales_that_follow_the_mesh(subject, follow):
     """Where the canonical mesh is stretched to twice its size, its Gaussians grow with it; without the switch not."""
@@ -279,6 +294,30 @@ def test_the_loss_is_the_weighted_sum(subject, views):
     assert terms["gaussians"] == gaussians.head.body.n_verts
 
 
+def test_ssim_takes_over_in_the_course_of_the_stage(subject, views):
+    """Steadily from the weights of the loss to its own, and the same from a saved state; without one, not at all."""
+    config = tiny_config(geometry={"iterations": 8, "ssim": 0.7})
+    stage = make_stage(subject, config)
+    assert stage.image_weights() == config.loss
+    run(stage, views, 4)
+    half = stage.image_weights()
+    assert (half.color, half.ssim) == pytest.approx((0.55, 0.45))
+    gaussians, target = stage.gaussians, views.images[0].float() / 255.0
+    with torch.no_grad():
+        posed = gaussians.head.posed(gaussians.head.pose(views.timesteps[0]))
+        image = gaussians.render(posed, views.cameras[0], WHITE).image
+    other = make_stage(subject, config)
+    other.load_state_dict(copy.deepcopy(stage.state_dict()))
+    for each in (stage, other):
+        terms = each.step(views.cameras[0], views.timesteps[0], target, WHITE)
+        assert terms["image"] == pytest.approx(image_loss(image, target, half).item(), rel=1e-5)
+    run(stage, views, 5)
+    assert (stage.image_weights().color, stage.image_weights().ssim) == pytest.approx((0.3, 0.7))
+    plain = make_stage(subject, tiny_config(geometry={"iterations": 2}))
+    run(plain, views, 2)
+    assert plain.image_weights() == plain.config.loss
+
+
 def test_the_loss_falls_and_the_mesh_grows_towards_the_truth(subject, views):
     """Thirty steps bring the images nearer, and the ball takes on some of the stretch that it lacked."""
     geometry = {"iterations": 30, "lambda_laplacian": 100.0, "lr_refine": 3e-2, "hidden": 32}
@@ -305,6 +344,27 @@ def test_the_loss_falls_and_the_mesh_grows_towards_the_truth(subject, views):
     run(stage, views, 30)
     assert score() < 0.85 * before
     assert width() > 1.02 * width_before
+
+
+def test_the_laplacian_keeps_faces_from_turning(subject, views):
+    """Without it single faces turn by tens of degrees, the start of the paper's folds; with it none does."""
+    turns = {}
+    for weight in (0.0, 1e5):
+        geometry = {"iterations": 40, "lambda_laplacian": weight, "lr_refine": 3e-2, "hidden": 32}
+        stage = make_stage(subject, tiny_config(geometry=geometry))
+        run(stage, views, 40)
+        head = stage.gaussians.head
+        with torch.no_grad():
+            fitted, parametric = (normals(verts, head.body.faces) for verts in (head.canonical(), head.shaped()))
+        turns[weight] = torch.rad2deg((fitted * parametric).sum(1).clamp(-1.0, 1.0).acos()).max().item()
+    assert turns[0.0] > 15.0
+    assert turns[1e5] < 1.0
+
+
+def normals(verts: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """Of faces."""
+    a, b, c = verts[faces.long()].unbind(1)
+    return torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=1), dim=1)
 
 
 def test_gradients_reach_everything_that_is_learned(subject, views):

@@ -165,6 +165,8 @@ def test_bad_input_is_refused(rng):
         blend_shapes(template, dirs[:, :4], coeffs)
     with pytest.raises(ValueError, match="coeffs is torch"):
         blend_shapes(template, dirs, coeffs.double())
+    with pytest.raises(ValueError, match="dirs must be contiguous"):
+        blend_shapes(template, torch.stack([*dirs], 2).movedim(2, 0), coeffs)
     with pytest.raises(ValueError, match="dirs requires a gradient"):
         blend_shapes(template, dirs.requires_grad_(), coeffs)
     joints, poses = chain(rng, 1.0)

@@ -91,7 +91,7 @@ def test_geometry_and_truth_appear_where_they_are_known(pair: tuple[Avatar, Subj
     metrics = evaluate_sample(avatar, known, avatar_path=tmp_path / "a.pt")
     text = write_report(tmp_path / "run", avatar, known, metrics, history=tmp_path / "gone").read_text("utf-8")
     assert "<span>truth</span>" in text
-    for cell in ("true surface to mesh", "<td>left</td>", "<td>right</td>"):
+    for cell in ("true surface to mesh", "<td>left</td>", "<td>right</td>", "<td>+ pose offsets</td>", "new crossings"):
         assert cell in text
 
 

@@ -12,10 +12,20 @@ import torch
 import warp as wp
 from PIL import Image
 
+from mgavatar.avatar import CaptureInfo
+from mgavatar.capture.subject import SPLITS
 from mgavatar.capture.synthetic import make_synthetic_capture
-from mgavatar.capture.synthetic_image import Studio, front_camera, frontal_arc, held_out_camera, make_look
+from mgavatar.capture.synthetic_image import (
+    Studio,
+    front_camera,
+    frontal_arc,
+    held_out_camera,
+    make_look,
+    side_cameras,
+)
 from mgavatar.capture.synthetic_motion import action_columns, perform
 from mgavatar.capture.synthetic_person import Person, Pose, make_person, subdivision, vertex_normals
+from mgavatar.capture.vhap import read_capture
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
 from mgavatar.head.procedural import build_head
@@ -181,12 +191,55 @@ def test_same_seed_same_bytes_and_another_seed_another_person(head: HeadModel, t
 
 
 def test_monocular(head: HeadModel, tmp_path: Path) -> None:
-    out = make_synthetic_capture(tmp_path / "mono", cameras=7, timesteps=5, size=(24, 32), head=head, monocular=True)
-    splits = {s: meta(out, f"_{s}")["frames"] for s in ("train", "val", "test")}
-    assert [f["timestep_index"] for f in splits["train"]] == [0, 1, 2, 3]
-    assert splits["val"] == []
-    assert [f["timestep_index"] for f in splits["test"]] == [4]
-    assert {f["camera_index"] for f in meta(out, "")["frames"]} == {0}
+    """Training and test are one camera's; val has two others, at some of the training timesteps."""
+    calls: list[tuple[int, int]] = []
+    out = make_synthetic_capture(
+        tmp_path / "mono",
+        cameras=7,
+        timesteps=13,
+        size=(24, 32),
+        head=head,
+        monocular=True,
+        progress=lambda *at: calls.append(at),
+    )
+    splits = {s: [(f["timestep_index"], f["camera_index"]) for f in meta(out, f"_{s}")["frames"]] for s in SPLITS}
+    assert splits["train"] == [(t, 0) for t in range(10)]
+    assert splits["test"] == [(t, 0) for t in range(10, 13)]
+    assert splits["val"] == [(t, c) for t in (0, 2, 4, 5, 7, 9) for c in (1, 2)]
+    assert calls == [(i + 1, 25) for i in range(25)]
+    assert len(list((out / "images").iterdir())) == len(list((out / "fg_masks").iterdir())) == 25
+    assert arrays(out / "ground_truth/truth.npz")["seen"].max() <= 10  # side cameras are not counted
+    assert len(meta(out, "")["frames"]) == 25
+    few = make_synthetic_capture(tmp_path / "few", timesteps=2, size=(16, 16), head=head, monocular=True)
+    assert [(f["timestep_index"], f["camera_index"]) for f in meta(few, "_val")["frames"]] == [(0, 1), (0, 2)]
+
+
+def test_side_cameras_of_a_monocular_capture_are_no_training_cameras(head: HeadModel, tmp_path: Path) -> None:
+    """What a fit remembers is the front camera alone; the sides see ears, the front camera's picture is another one."""
+    out = make_synthetic_capture(tmp_path / "mono", timesteps=3, size=(48, 48), head=head, monocular=True)
+    subject = read_capture(out)
+    assert set(CaptureInfo.of(subject).cameras) == {0}
+    yaws = [np.degrees(np.arctan2(*(f.camera.position - [0, 0, -0.02])[[0, 2]])) for f in subject.frames["val"]]
+    np.testing.assert_allclose(yaws, [-60, 60, -60, 60], atol=1e-9)
+    assert [f.camera.K.tolist() for f in subject.frames["val"]] == [front_camera((48, 48)).K.tolist()] * 4
+    front, left, right = (pixels(out / f"images/00000_{c:02d}.png").astype(float) for c in range(3))
+    assert min(np.abs(a - b).mean() for a, b in ((front, left), (front, right), (left, right))) > 5
+    assert np.abs(left - right).mean() > np.abs(left - right[:, ::-1]).mean()  # mirror images, about
+
+
+@pytest.mark.parametrize("options", [{"cameras": 2}, {"cameras": 16}, {"monocular": True}], ids=str)
+@pytest.mark.parametrize("timesteps", [2, 7])
+def test_splits_never_overlap(options: dict, timesteps: int, head: HeadModel, tmp_path: Path) -> None:
+    """No image of training is held out, by camera and timestep, by file or by content."""
+    out = make_synthetic_capture(tmp_path / "x", timesteps=timesteps, size=(16, 16), head=head, **options)
+    frames = read_capture(out).frames
+    every = [frame for split in SPLITS for frame in frames[split]]
+    assert all(frames[split] for split in SPLITS)
+    assert len({(frame.camera_id, frame.timestep) for frame in every}) == len(every)
+    assert len({frame.image_path.resolve() for frame in every}) == len(every)
+    held_out = {frame.image_path.read_bytes() for split in ("val", "test") for frame in frames[split]}
+    assert not held_out & {frame.image_path.read_bytes() for frame in frames["train"]}
+    assert not {f.timestep for f in frames["test"]} & {f.timestep for s in ("train", "val") for f in frames[s]}
 
 
 def test_refusals(head: HeadModel, tmp_path: Path) -> None:
@@ -323,3 +376,4 @@ def test_cameras_stand_around_the_face() -> None:
     assert sum(v.position[1] > 0 for v in views) == 8
     assert abs(front_camera((64, 64)).position[0]) < 1e-9
     assert len(frontal_arc(3, (64, 64))) == 3
+    assert len(side_cameras((64, 64))) == 2

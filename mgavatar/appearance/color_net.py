@@ -5,8 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import ColorNetConfig
+from mgavatar.config import ColorNetConfig, settled
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
+from mgavatar.kernels.mlp import linear_layers, mlp
 
 
 class ColorNet(nn.Module):
@@ -20,13 +21,14 @@ class ColorNet(nn.Module):
         self.register_buffer("low", low)
         self.register_buffer("size", high - low)
         shape = HashGridShape(
-            levels=config.levels,
+            levels=settled(config.levels),
             base_resolution=config.base_resolution,
-            max_resolution=config.max_resolution,
+            max_resolution=settled(config.max_resolution),
             log2_table_size=config.log2_table_size,
         )
         self.grid = HashGrid(shape, seed=seed)
-        n_in = self.grid.n_outputs + 3
+        self.sees_directions = config.view_frame != "none"
+        n_in = self.grid.n_outputs + 3 * self.sees_directions
         self.mlp = nn.Sequential(nn.Linear(n_in, config.hidden), nn.ReLU(), nn.Linear(config.hidden, 3))
 
     def forward(self, canonical_means: Tensor, directions: Tensor) -> Tensor:
@@ -34,10 +36,11 @@ class ColorNet(nn.Module):
 
         Args:
             canonical_means: ``mu_c`` [m], shape [N, 3].
-            directions: Unit view directions, shape [N, 3].
+            directions: Unit view directions, shape [N, 3]; not looked at where ``view_frame`` is ``none``.
 
         Returns:
             RGB in 0..1, shape [N, 3].
         """
         features = self.grid((canonical_means - self.low) / self.size)
-        return torch.sigmoid(self.mlp(torch.cat([features, directions], 1)))
+        weights, biases = linear_layers(self.mlp)
+        return torch.sigmoid(mlp(features, weights, biases, extra=directions if self.sees_directions else None))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mgavatar.appearance.face_gaussians import PARAMETERS, FaceGaussians
+from mgavatar.appearance.face_gaussians import FaceGaussians
 from mgavatar.config import DensityConfig
 from mgavatar.kernels.rasterize import Rendering
 
@@ -36,9 +36,11 @@ class DensityControl:
         self.total += torch.where(rendering.visible, (screen_grads * half).norm(dim=1), 0.0)
         self.seen += rendering.visible
 
-    def due(self, iteration: int) -> bool:
+    def due(self, before: float, now: float) -> bool:
+        """Whether a round falls into the piece of the schedule after ``before`` up to ``now``, in iterations."""
         c = self.config
-        return c.start <= iteration <= c.stop and iteration % c.every == 0
+        last = now // c.every * c.every
+        return last > before and c.start <= last <= c.stop
 
     def refine(self, optimizer: torch.optim.Adam, face_scales: Tensor) -> None:
         """Clone small Gaussians and split large ones where the gradient asks for it, then remove faint ones.
@@ -66,7 +68,7 @@ class DensityControl:
             torch.sigmoid(torch.cat([g.opacity_logits.detach()[keep], added["opacity_logits"]])), g.face_ids[rows]
         )
         face_ids = g.face_ids[rows][alive]
-        for name in PARAMETERS:
+        for name in g.parameter_names:
             old = getattr(g, name)
             new = nn.Parameter(torch.cat([old.detach()[keep], added[name]])[alive])
             _replace(optimizer, old, new, keep, n_kept, alive)
@@ -77,7 +79,7 @@ class DensityControl:
     def _children(self, parents: Tensor, split: Tensor) -> dict[str, Tensor]:
         """Copies of their parents; halves of a split are moved inside it and made smaller, in local units."""
         g = self.gaussians
-        values = {name: getattr(g, name).detach()[parents].clone() for name in PARAMETERS}
+        values = {name: getattr(g, name).detach()[parents].clone() for name in g.parameter_names}
         halves = split[parents]
         noise = torch.randn(len(parents), 3, generator=self.generator).to(parents.device)
         step = noise * values["log_scales"].exp()

@@ -9,9 +9,13 @@ from torch import Tensor, nn
 
 from mgavatar.config import AppearanceConfig
 from mgavatar.kernels.binding import face_frames, to_world
+from mgavatar.kernels.face_bound import place_on_faces
 
 PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
-"""Learnable rows of a Gaussian; ``face_ids`` goes along with them."""
+"""Learnable rows of every Gaussian; ``face_ids`` goes along with them."""
+
+SH_PARAMETERS = ("sh_constant", "sh_others")
+"""More of them, where colours are spherical harmonics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +34,13 @@ class FaceFrames:
 
     @staticmethod
     def of(verts: Tensor, faces: Tensor) -> FaceFrames:
-        """Frames of a mesh; the mesh is frozen here, so without gradients."""
-        with torch.no_grad():
-            return FaceFrames(*face_frames(verts, faces))
+        """Frames of a mesh, differentiable in its vertices."""
+        return FaceFrames(*face_frames(verts, faces))
+
+    @property
+    def all(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Frames of all faces, as the kernels take them."""
+        return self.quats, self.scales, self.centers
 
     def at(self, face_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Frames of chosen faces."""
@@ -54,6 +62,12 @@ class FaceGaussians(nn.Module):
         self.quats = nn.Parameter(quats)
         self.log_scales = nn.Parameter(scales.log().repeat(n_faces, 1))
         self.opacity_logits = nn.Parameter(torch.full((n_faces,), logit, device=device))
+        self.parameter_names: tuple[str, ...] = PARAMETERS
+        if config.colors == "sh":
+            self.parameter_names += SH_PARAMETERS
+            n_others = (config.sh.degree + 1) ** 2 - 1
+            self.sh_constant = nn.Parameter(torch.zeros(n_faces, 3, device=device))
+            self.sh_others = nn.Parameter(torch.zeros(n_faces, n_others, 3, device=device))
         self.face_ids: Tensor
         self.uvs: Tensor
         self.register_buffer("face_ids", torch.arange(n_faces, device=device))
@@ -65,12 +79,11 @@ class FaceGaussians(nn.Module):
     def canonical_means(self, frames: FaceFrames) -> Tensor:
         """``mu_c`` of Eq. 9: centres on the canonical mesh [m], shape [N, 3]. No gradient: the encoding stays put."""
         with torch.no_grad():
-            ones = torch.ones_like(self.local_means)
-            return to_world(*frames.at(self.face_ids), self.local_means, self.quats, ones)[0]
+            return place_on_faces(frames.all, self.face_ids, self.local_means)
 
     def resize(self, n: int) -> None:
         """Make room for ``n`` Gaussians, before a state of that many is loaded."""
-        for name in PARAMETERS:
+        for name in self.parameter_names:
             old = getattr(self, name)
             setattr(self, name, nn.Parameter(old.new_zeros(n, *old.shape[1:])))
         self.face_ids = self.face_ids.new_zeros(n)

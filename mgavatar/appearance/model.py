@@ -10,13 +10,14 @@ from torch import Tensor, nn
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, FaceGaussians, face_uvs
-from mgavatar.appearance.offset_net import OffsetNet, Offsets
+from mgavatar.appearance.offset_net import OffsetNet
+from mgavatar.appearance.spherical_harmonics import sh_colors
 from mgavatar.camera import Camera
 from mgavatar.config import FitConfig
 from mgavatar.gaussians import Gaussians
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Pose
-from mgavatar.kernels.binding import to_world
+from mgavatar.kernels.face_bound import bind_to_faces, directions_on_faces
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
 
@@ -53,7 +54,7 @@ class FrozenHead:
             parameter.requires_grad_(False)
         with torch.no_grad():
             self.canonical = head.canonical()
-        self.frames = FaceFrames.of(self.canonical, self.body.faces)
+            self.frames = FaceFrames.of(self.canonical, self.body.faces)
         low, high = self.canonical.min(0).values, self.canonical.max(0).values
         self.low, self.high = low, high
         self.extent = float((high - low).norm())
@@ -74,15 +75,17 @@ class FrozenHead:
         return position_map(self._uv, (verts - center) / half)
 
     def posed(self, pose: Pose) -> PosedMesh:
-        """The head in any pose."""
+        """The head in any pose, differentiable in it."""
+        verts = self.head.posed(pose).verts
         with torch.no_grad():
-            verts = self.head.posed(pose).verts
             still = self.head.posed(pose.centered()).verts if self._uv is not None else verts
             theta = pose.joint_rotations().reshape(-1)
-            return PosedMesh(verts, FaceFrames.of(verts, self.body.faces), self._map(still), theta)
+            pose_map = self._map(still)
+        return PosedMesh(verts, FaceFrames.of(verts, self.body.faces), pose_map, theta)
 
+    @torch.no_grad()
     def at_timestep(self, timestep: int) -> PosedMesh:
-        """The head at a timestep of its capture; the most recently used ones are kept."""
+        """The head at a timestep of its capture; the most recently used ones are kept. No gradient."""
         if timestep not in self._posed:
             if len(self._posed) >= _CACHED_POSES:
                 self._posed.popitem(last=False)
@@ -92,7 +95,7 @@ class FrozenHead:
 
 
 class Appearance(nn.Module):
-    """Face-bound Gaussians with ColorNet and OffsetNet."""
+    """Face-bound Gaussians with ColorNet (or spherical harmonics) and OffsetNet."""
 
     def __init__(self, frozen: FrozenHead, config: FitConfig, *, seed: int) -> None:
         super().__init__()
@@ -102,7 +105,12 @@ class Appearance(nn.Module):
         device = frozen.canonical.device
         self.gaussians = FaceGaussians(len(frozen.body.faces), a, device)
         margin = 0.05 * (frozen.high - frozen.low)
-        self.color_net = ColorNet(frozen.low - margin, frozen.high + margin, a.color_net, seed=seed).to(device)
+        self.color_net = (
+            ColorNet(frozen.low - margin, frozen.high + margin, a.color_net, seed=seed).to(device)
+            if a.colors == "color_net"
+            else None
+        )
+        self.view_frame = a.color_net.view_frame if a.colors == "color_net" else a.sh.view_frame
         self.offset_net = OffsetNet(a.offset_net).to(device) if a.offset_net.enabled else None
         self._sampler: SparseMatrix | None = None
 
@@ -120,23 +128,23 @@ class Appearance(nn.Module):
         self.gaussians.resize(n)
         self._sampler = None
 
-    def _offsets(self, posed: PosedMesh) -> tuple[Tensor, Offsets] | None:
+    def _offsets(self, posed: PosedMesh) -> tuple[Tensor, Tensor] | None:
+        """``O_map`` [13, H, W], and what each Gaussian reads there [N, 13]."""
         if self.offset_net is None:
             return None
         maps = self.offset_net(self.frozen.canonical_map, posed.pose_map, posed.theta)
         if self._sampler is None:
             self._sampler = uv_sampler(self.gaussians.uvs, *maps.shape[1:])
-        return maps, Offsets.of(sparse_apply(self._sampler, maps.reshape(len(maps), -1).T.contiguous()))
+        return maps, sparse_apply(self._sampler, maps.reshape(len(maps), -1).T.contiguous())
 
     def _directions(self, means: Tensor, posed: PosedMesh, camera: Camera) -> Tensor:
-        """Unit view directions of Eq. 9, in the frame that ``color_net.view_frame`` names."""
+        """Unit view directions of Eq. 9, in the frame that ``view_frame`` names."""
         position = torch.tensor(camera.position, dtype=torch.float32, device=means.device)
-        directions = torch.nn.functional.normalize(means.detach() - position, dim=1)
-        if self.config.appearance.color_net.view_frame == "world":
-            return directions
-        face_ids = self.gaussians.face_ids
-        back = _rotate(posed.frames.quats[face_ids] * _CONJUGATE.to(means.device), directions)
-        return _rotate(self.frozen.frames.quats[face_ids], back)
+        means = means.detach()
+        if self.view_frame in ("world", "none"):
+            return torch.nn.functional.normalize(means - position, dim=1)
+        quats = posed.frames.quats.detach(), self.frozen.frames.quats
+        return directions_on_faces(means, position, self.gaussians.face_ids, *quats)
 
     def forward(self, posed: PosedMesh, camera: Camera) -> tuple[Gaussians, Tensor | None]:
         """Gaussians of one view.
@@ -145,30 +153,18 @@ class Appearance(nn.Module):
             The Gaussians ``G_r`` of Section 3.2, and ``O_map`` [13, H, W] for its regulariser, or None without it.
         """
         g = self.gaussians
-        means, quats, log_scales, logits = (getattr(g, name) for name in PARAMETERS)
         offsets = self._offsets(posed)
+        means, quats, scales, opacities, more_colors = bind_to_faces(
+            posed.frames.all,
+            g.face_ids,
+            *(getattr(g, name) for name in PARAMETERS),
+            offsets=offsets[1] if offsets else None,
+        )
+        directions = self._directions(means, posed, camera)
+        if self.color_net is not None:
+            colors = self.color_net(g.canonical_means(self.frozen.frames), directions)
+        else:
+            colors = sh_colors(g.sh_constant, g.sh_others, directions)
         if offsets is not None:
-            delta = offsets[1]
-            half = torch.cat([torch.ones_like(delta.rotations[:, :1]), 0.5 * delta.rotations], 1)
-            means, quats = means + delta.means, _product(quats, half)
-            log_scales, logits = log_scales + delta.log_scales, logits + delta.opacity_logits
-        means, quats, scales = to_world(*posed.frames.at(g.face_ids), means, quats, log_scales.exp())
-        colors = self.color_net(g.canonical_means(self.frozen.frames), self._directions(means, posed, camera))
-        if offsets is not None:
-            colors = colors + offsets[1].colors
-        return Gaussians(means, quats, scales, torch.sigmoid(logits), colors), offsets[0] if offsets else None
-
-
-_CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0])
-
-
-def _product(p: Tensor, q: Tensor) -> Tensor:
-    """Hamilton product of quaternions wxyz, shapes [N, 4]."""
-    pw, pv, qw, qv = p[:, :1], p[:, 1:], q[:, :1], q[:, 1:]
-    return torch.cat([pw * qw - (pv * qv).sum(1, keepdim=True), pw * qv + qw * pv + torch.cross(pv, qv, dim=1)], 1)
-
-
-def _rotate(q: Tensor, v: Tensor) -> Tensor:
-    """Vectors [N, 3] turned by unit quaternions wxyz [N, 4]."""
-    t = 2.0 * torch.cross(q[:, 1:], v, dim=1)
-    return v + q[:, :1] * t + torch.cross(q[:, 1:], t, dim=1)
+            colors = colors + more_colors
+        return Gaussians(means, quats, scales, opacities, colors), offsets[0] if offsets else None

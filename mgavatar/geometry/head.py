@@ -55,6 +55,16 @@ class PersonalHead(nn.Module):
                 for name, value in tracked.items()
             }
         )
+        for name in ("jaw", "eyes"):
+            self.poses[name].requires_grad_(bool(getattr(config, f"learn_{name}")))
+        self.tracked_offsets: Tensor
+        known = _base_offsets(params.static_offset, len(body.v_template)) if config.tracked_offsets else None
+        offsets = torch.zeros(0, 3) if known is None else torch.from_numpy(known)
+        self.register_buffer("tracked_offsets", offsets.to(device), persistent=False)
+        self.config = config
+        self.tracked_joints: Tensor
+        with torch.no_grad():
+            self.register_buffer("tracked_joints", body.joints(self._tracked_shape(params)), persistent=False)
         template = torch.tensor(body.fine.v_template, device=device)
         self.refine = RefineNet(template, config).to(device)
 
@@ -64,16 +74,42 @@ class PersonalHead(nn.Module):
             *(self.poses[name][timestep] for name in ("expr", "rotation", "neck", "jaw", "eyes", "translation"))
         )
 
+    def shaped(self) -> Tensor:
+        """``mu_bar``, the parametric identity [m], with the tracker's offsets if the configuration takes them."""
+        shaped = self.body.shaped(self.betas)
+        return shaped + self.body.carry(self.tracked_offsets) if len(self.tracked_offsets) else shaped
+
     def posed(self, pose: Pose) -> PosedHead:
         """Eq. 1 to 3, then expression, pose and skinning."""
         features = self.refine.encode()
-        shaped = self.body.shaped(self.betas)
+        shaped = self.shaped()
         identity = self.refine.identity_offsets(features)
         by_pose = self.refine.pose_offsets(features, torch.cat([pose.neck, pose.jaw, pose.eyes]))
         canonical = shaped + identity
-        joints = self.body.joints(canonical)
+        joints = self.joints(canonical)
         return PosedHead(shaped, identity, by_pose, self.body.posed(canonical + by_pose, pose, joints=joints))
+
+    def _tracked_shape(self, params: HeadParams) -> Tensor:
+        """The tracker's own neutral head [m], with its offsets where it has some."""
+        betas = torch.from_numpy(fitted(params.shape, self.body.model.n_shape)).to(self.body.device)
+        offsets = _base_offsets(params.static_offset, len(self.body.v_template))
+        shaped = self.body.shaped(betas)
+        return shaped if offsets is None else shaped + self.body.carry(torch.from_numpy(offsets).to(shaped))
+
+    def joints(self, canonical: Tensor) -> Tensor:
+        """Rest joints [m], shape [5, 3], as ``config.joints`` says."""
+        return self.body.joints(canonical) if self.config.joints == "refined" else self.tracked_joints
 
     def canonical(self) -> Tensor:
         """``mu_c`` of Eq. 1: the neutral personal head [m], shape [V, 3]."""
-        return self.body.shaped(self.betas) + self.refine.identity_offsets(self.refine.encode())
+        return self.shaped() + self.refine.identity_offsets(self.refine.encode())
+
+
+def _base_offsets(static_offset: np.ndarray | None, n_verts: int) -> np.ndarray | None:
+    """The tracker's offsets [m] for each vertex of the head model, shape [n_verts, 3]; zero where it has none (teeth)."""
+    if static_offset is None:
+        return None
+    offsets = np.zeros((n_verts, 3), np.float32)
+    n = min(n_verts, len(static_offset))
+    offsets[:n] = static_offset[:n]
+    return offsets

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.config import GeometryConfig
+from mgavatar.kernels.mlp import linear_layers, mlp
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import uv_sampler
 
@@ -36,7 +37,7 @@ class RefineNet(nn.Module):
         resolution, channels = config.triplane_resolution, config.triplane_channels
         self.unit = config.offset_unit
         self.planes = nn.Parameter(0.1 * torch.randn(3, resolution**2, channels))
-        self.phi_id = _mlp(3 * channels, config.hidden)
+        self.phi_id = _mlp(3 * channels, config.hidden) if config.identity_offsets else None
         self.phi_pose = _mlp(3 * channels + N_POSE, config.hidden) if config.pose_offsets else None
         low, high = v_template.min(0).values, v_template.max(0).values
         place = ((v_template - low) / (high - low).max()).cpu()
@@ -51,15 +52,19 @@ class RefineNet(nn.Module):
         return torch.cat([sparse_apply(s, plane) for s, plane in zip(self._samplers, self.planes, strict=True)], 1)
 
     def identity_offsets(self, features: Tensor) -> Tensor:
-        """Eq. 1: ``delta mu_id`` [m], shape [V, 3]."""
-        return self.unit * self.phi_id(features)
+        """Eq. 1: ``delta mu_id`` [m], shape [V, 3]; zero if switched off."""
+        if self.phi_id is None:
+            return torch.zeros(len(features), 3, device=features.device)
+        weights, biases = linear_layers(self.phi_id)
+        return self.unit * mlp(features, weights, biases)
 
     def pose_offsets(self, features: Tensor, pose: Tensor) -> Tensor:
         """Eq. 2: ``delta mu_pose`` [m] from neck, jaw and eye rotations [12], shape [V, 3]; zero if switched off."""
         if self.phi_pose is None:
             return torch.zeros(len(features), 3, device=features.device)
-        weight, bias = self.phi_pose[0].parameters()
+        weights, biases = linear_layers(self.phi_pose)
         n = features.shape[1]
         # The pose is the same for all vertices: its share of the first layer is one vector.
-        hidden = features @ weight[:, :n].T + (weight[:, n:] @ pose + bias)
-        return self.unit * self.phi_pose[1:](hidden)
+        biases[0] = biases[0] + weights[0][:, n:] @ pose
+        weights[0] = weights[0][:, :n]
+        return self.unit * mlp(features, weights, biases)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mgavatar.camera import Camera
-from mgavatar.config import FitConfig
+from mgavatar.config import FitConfig, ImageLossConfig
 from mgavatar.gaussians import SH_C0, Gaussians, draw
 from mgavatar.geometry.head import PersonalHead, PosedHead
 from mgavatar.kernels.laplacian import laplacian
-from mgavatar.kernels.rasterize import Rendering
+from mgavatar.kernels.rasterize import RasterSettings, Rendering
 from mgavatar.losses import image_loss
 
 
@@ -37,21 +40,39 @@ class VertexGaussians(nn.Module):
         edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
-    def bound(self, posed: PosedHead) -> Gaussians:
-        """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas."""
+    def bound(self, posed: PosedHead, camera: Camera | None = None, *, scales: Tensor | None = None) -> Gaussians:
+        """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas.
+
+        Sigmas are those that the camera sees, with the low pass of the rasterizer: what makes the outline of small
+        Gaussians is as much the pixels as themselves. Without a camera they are the Gaussians' own. ``scales`` are
+        those of :meth:`scales`, for a caller that has them already.
+        """
         verts = posed.verts
-        scales = self.scales(posed)
+        scales = self.scales(posed) if scales is None else scales
         shift = self.config.geometry.surface_shift
         if shift:
-            verts = verts - shift * scales.detach()[:, None] * self.head.body.normals(verts)
+            apparent = apparent_sigmas(scales.detach(), verts.detach(), camera)
+            verts = verts - shift * apparent[:, None] * self.head.body.normals(verts)
         n = len(verts)
         quats = torch.zeros(n, 4, device=verts.device)
         quats[:, 0] = 1.0
         ones = torch.ones(n, device=verts.device)
         return Gaussians(verts, quats, scales[:, None].expand(n, 3), ones, 0.5 + SH_C0 * self.colors)
 
-    def render(self, posed: PosedHead, camera: Camera, background: Tensor) -> Rendering:
-        return draw(self.bound(posed), camera, background=background, config=self.config.raster)
+    def render(
+        self, posed: PosedHead, camera: Camera, background: Tensor, *, scales: Tensor | None = None
+    ) -> Rendering:
+        gaussians = self.bound(posed, camera, scales=scales)
+        return draw(gaussians, camera, background=background, config=self.config.raster)
+
+
+def apparent_sigmas(sigmas: Tensor, means: Tensor, camera: Camera | None) -> Tensor:
+    """Standard deviations as a camera sees them at their distance, low pass included [m], shape [N]."""
+    if camera is None:
+        return sigmas
+    row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
+    pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
+    return (sigmas.square() + RasterSettings.low_pass * pixels.square()).sqrt()
 
 
 def offset_loss(posed: PosedHead, scales: Tensor) -> Tensor:
@@ -76,6 +97,8 @@ class GeometryStage:
         self.gaussians = gaussians
         self.config = config
         self.iterations = config.geometry.iterations
+        self.position = 0.0
+        """Place in the schedule of the rates, in iterations as configured."""
         g, head = config.geometry, gaussians.head
         poses = head.poses
         groups = [
@@ -88,38 +111,54 @@ class GeometryStage:
             {"params": [gaussians.colors], "lr": g.lr_color},
         ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        decay = g.final_lr ** (1.0 / max(1, g.iterations))
-        self.schedule = torch.optim.lr_scheduler.ExponentialLR(self.optimizer, decay)
+        self.decay = g.final_lr ** (1.0 / max(1, g.iterations))
 
-    def step(self, camera: Camera, timestep: int, target: Tensor, background: Tensor) -> dict[str, float]:
-        """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss."""
+    def step(
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+    ) -> dict[str, float]:
+        """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
+
+        The schedule moves on by ``advance`` configured iterations: another number than 1 makes it shorter or longer.
+        """
         g = self.config.geometry
         head = self.gaussians.head
         posed = head.posed(head.pose(timestep))
-        image = self.gaussians.render(posed, camera, background).image
         scales = self.gaussians.scales(posed)
-        image_term = image_loss(image, target, self.config.loss)
+        image = self.gaussians.render(posed, camera, background, scales=scales).image
+        image_term = image_loss(image, target, self.image_weights())
         offset_term = g.lambda_offset * offset_loss(posed, scales)
         laplacian_term = g.lambda_laplacian * laplacian_loss(self.gaussians, posed, scales)
         loss = image_term + offset_term + laplacian_term
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        self.schedule.step()
+        for group in self.optimizer.param_groups:
+            group["lr"] *= self.decay**advance
+        self.position += advance
         if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn, so no other term would tell
             loss = loss * torch.nan
         terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()
         return dict(zip(("loss", "image", "offset", "laplacian"), terms, strict=True)) | {"gaussians": len(scales)}
+
+    def image_weights(self) -> ImageLossConfig:
+        """Weights of Eq. 4 at this point of the stage: from those of ``loss`` to those of ``geometry.ssim``."""
+        start, end = self.config.loss, self.config.geometry.ssim
+        if end is None:
+            return start
+        done = min(1.0, self.position / max(1, self.iterations))
+        return ImageLossConfig(
+            color=(1.0 - done) * start.color + done * (1.0 - end), ssim=(1.0 - done) * start.ssim + done * end
+        )
 
     def state_dict(self) -> dict[str, object]:
         """Everything a later process needs to go on."""
         return {
             "gaussians": self.gaussians.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict(),
+            "position": self.position,
         }
 
-    def load_state_dict(self, state: dict[str, dict]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         self.gaussians.load_state_dict(state["gaussians"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.schedule.load_state_dict(state["schedule"])
+        self.position = state["position"]

@@ -99,7 +99,7 @@ class Body:
         self.faces = torch.tensor(self.fine.faces, dtype=torch.int32, device=self.device)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.tensor(array, dtype=torch.float32, device=self.device)
+        return torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=self.device)
 
     @property
     def n_verts(self) -> int:

@@ -129,3 +129,37 @@ def hash_encode(points: Tensor, table: Tensor, levels: Tensor) -> Tensor:
             total = total + weight * table[first + entry]
         features.append(total)
     return torch.cat(features, 1)
+
+
+def quat_product(p: Tensor, q: Tensor) -> Tensor:
+    """Hamilton product of quaternions wxyz."""
+    pw, pv, qw, qv = p[:, :1], p[:, 1:], q[:, :1], q[:, 1:]
+    vector = pw * qv + qw * pv + torch.linalg.cross(pv, qv)
+    return torch.cat([pw * qw - (pv * qv).sum(1, keepdim=True), vector], 1)
+
+
+def bind_to_faces(
+    face_quats: Tensor,
+    face_scales: Tensor,
+    face_centers: Tensor,
+    face_ids: Tensor,
+    local_means: Tensor,
+    local_quats: Tensor,
+    log_scales: Tensor,
+    logits: Tensor,
+    offsets: Tensor,
+) -> tuple[Tensor, ...]:
+    """Offsets, then exponentials, then Eq. 8, one after the other."""
+    move, color, turn, larger, more = offsets.split([3, 3, 3, 3, 1], 1)
+    small = torch.cat([torch.ones_like(more), turn / 2], 1)
+    q, k = face_quats[face_ids], face_scales[face_ids, None]
+    means = k * (quat_matrix(q) @ (local_means + move)[:, :, None])[:, :, 0] + face_centers[face_ids]
+    quats = quat_product(q, quat_product(local_quats, small))
+    return means, quats, k * torch.exp(log_scales + larger), torch.sigmoid(logits + more[:, 0]), color
+
+
+def mlp(x: Tensor, weights: list[Tensor], biases: list[Tensor]) -> Tensor:
+    """Layers with ReLU between them."""
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        x = torch.clamp(x @ weight.T + bias, min=0.0)
+    return x @ weights[-1].T + biases[-1]

@@ -1,0 +1,70 @@
+"""What a fit took, as ``summary.json``: time and iterations of its stages, memory, size."""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mgavatar.files import atomic_write
+
+
+class Summary:
+    """Adds up over the interruptions of a fit.
+
+    Attributes:
+        seconds: Of the fit before this process.
+        peak_mib: Peak memory before this process [MiB].
+        stages: Iterations, configured iterations and seconds of each stage so far.
+    """
+
+    def __init__(self, before: dict[str, Any] | None = None, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Start, or go on from the ``state`` in a checkpoint."""
+        before = before or {"seconds": 0.0, "peak_mib": 0.0, "stages": {}}
+        self.seconds: float = before["seconds"]
+        self.peak_mib: float = before["peak_mib"]
+        self.stages: dict[str, dict[str, Any]] = {name: dict(stage) for name, stage in before["stages"].items()}
+        self.clock = clock
+        self.started = clock()
+
+    def stage(self, name: str, *, iterations: int, configured: int, seconds: float) -> None:
+        """Note how far a stage is; ``seconds`` of its loop since it was last noted."""
+        before = self.stages.get(name, {"seconds": 0.0})["seconds"]
+        self.stages[name] = {
+            "iterations": iterations,
+            "configured": configured,
+            "seconds": round(before + seconds, 3),
+        }
+
+    def told(self) -> str:
+        """In words, for the user."""
+        stages = self.stages.items()
+        return ", ".join(f"{name} {stage['iterations']} of {stage['configured']} iterations" for name, stage in stages)
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint keeps."""
+        return {
+            "seconds": round(self.seconds + self.clock() - self.started, 3),
+            "peak_mib": max(self.peak_mib, peak_mib()),
+            "stages": self.stages,
+        }
+
+    def write(self, path: Path, **more: Any) -> None:
+        """Write the file, with what else is to be in it. Atomic."""
+        table = self.state() | more
+        if torch.cuda.is_available():
+            table["peak_cuda_mib"] = round(torch.cuda.max_memory_allocated() / 2**20, 1)
+        with atomic_write(path) as file:
+            file.write((json.dumps(table, indent=2) + "\n").encode())
+
+
+def peak_mib() -> float:
+    """Most memory that this process has held [MiB]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)

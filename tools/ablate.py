@@ -1,0 +1,308 @@
+"""Fit presets to captures under equal conditions and put them side by side: a table and a contact sheet.
+
+python tools/ablate.py --presets quick quick,baseline quick,no-laplacian --captures DIR[:HEAD.npz] ... --out DIR
+
+Each cell, one preset on one capture, is a `mgavatar fit` and a `mgavatar evaluate` in processes of their own. What is
+done is not done again, an interrupted fit goes on, a failed one is reported and tried again the next time. --out gets
+table.md, table.json, sheet.png and a folder for each cell with its run, its log and its metrics.json.
+
+Seconds and memory are the fit's own. A --budget runs from the start of the process, and the first fit after a change of
+the kernels compiles them: fit once before, for equal time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mgavatar.config import read_preset
+from mgavatar.errors import DataError
+
+# Nothing heavy is imported before the last fit has ended: a child's peak of memory is at least what its parent holds.
+
+MGAVATAR = (sys.executable, "-c", "from mgavatar.cli import main; main()")
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What all cells have in common."""
+
+    out: Path
+    seed: int = 0
+    budget: str | None = None
+    device: str = "auto"
+    lpips_weights: Path | None = None
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One preset on one capture."""
+
+    preset: str
+    data: Path
+    head_model: Path | None
+    options: Options
+
+    @property
+    def capture(self) -> str:
+        return self.data.resolve().name
+
+    @property
+    def name(self) -> str:
+        return "+".join(Path(part).stem if part.endswith(".toml") else part for part in self.preset.split(","))
+
+    @property
+    def folder(self) -> Path:
+        return self.options.out / self.capture / self.name
+
+    @property
+    def run(self) -> Path:
+        return self.folder / "run"
+
+    @property
+    def metrics(self) -> Path:
+        return self.folder / "metrics.json"
+
+    @property
+    def summary(self) -> Path:
+        return self.run / "summary.json"
+
+    def conditions(self) -> dict[str, Any]:
+        """What a cell that is there already must have been made with."""
+        return {
+            "preset": read_preset(self.preset),
+            "data": str(self.data.resolve()),
+            "head_model": str(self.head_model.resolve()) if self.head_model else None,
+            "seed": self.options.seed,
+            "budget": self.options.budget,
+            "device": self.options.device,
+        }
+
+    def fit_command(self, *, resume: bool) -> list[str]:
+        o = self.options
+        command = ["fit", "--data", str(self.data), "--out", str(self.run), "--preset", self.preset]
+        command += ["--seed", str(o.seed), "--device", o.device]
+        command += ["--head-model", str(self.head_model)] if self.head_model else []
+        command += ["--budget", o.budget] if o.budget else []
+        return command + (["--resume"] if resume else [])
+
+    def evaluate_command(self) -> list[str]:
+        o = self.options
+        command = ["evaluate", "--avatar", str(self.run), "--data", str(self.data), "--json", str(self.metrics)]
+        return [*command, "--device", o.device, *(["--lpips-weights", str(o.lpips_weights)] if o.lpips_weights else [])]
+
+
+def plan_cells(presets: Sequence[str], captures: Sequence[str], options: Options) -> list[Cell]:
+    """All cells, capture by capture, after checking what can be checked without work.
+
+    Raises:
+        DataError: If a preset or a folder does not exist, two have one name, or --out has cells of other conditions.
+    """
+    places = []
+    for text in captures:
+        data, _, head = text.rpartition(":") if text.endswith((".npz", ".pkl")) else (text, "", "")
+        places.append((Path(data), Path(head) if head else None))
+    cells = [Cell(preset, data, head, options) for data, head in places for preset in presets]
+    if len({cell.folder for cell in cells}) < len(cells):
+        raise DataError("two captures or two presets have one name; give each a name of its own")
+    for cell in cells:
+        if not (cell.data / "transforms_train.json").is_file():
+            raise DataError(f"{cell.data}: no transforms_train.json in this folder; give the folder of a capture")
+        if cell.head_model and not cell.head_model.is_file():
+            raise DataError(f"{cell.head_model}: no such file; give the head model of {cell.data}")
+        noted, conditions = cell.folder / "cell.json", cell.conditions()
+        if noted.is_file() and json.loads(noted.read_text("utf-8")) != conditions:
+            raise DataError(f"{cell.folder}: was made under other conditions; give another --out, or remove it")
+    return cells
+
+
+def run_command(command: Sequence[str], log: Path) -> int:
+    """Run mgavatar, its words into a file; Ctrl-C is passed on once, so that a fit can save itself."""
+    with log.open("ab") as file:
+        file.write(f"$ mgavatar {' '.join(command)}\n".encode())
+        file.flush()
+        child = subprocess.Popen(
+            [*MGAVATAR, *command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+        )
+        try:
+            return child.wait()
+        except KeyboardInterrupt:
+            child.send_signal(signal.SIGINT)
+            child.wait()
+            raise
+
+
+def complete(cell: Cell) -> str | None:
+    """Do what is left to do of a cell; the reason if that fails."""
+    if cell.metrics.is_file() and not _lacks_lpips(cell):
+        return None
+    cell.folder.mkdir(parents=True, exist_ok=True)
+    (cell.folder / "cell.json").write_text(json.dumps(cell.conditions(), indent=1), "utf-8")
+    log = cell.folder / "log.txt"
+    if not cell.summary.is_file():
+        resume = (cell.run / "checkpoint.pt").is_file()
+        if not resume:
+            shutil.rmtree(cell.run, ignore_errors=True)
+        code = run_command(cell.fit_command(resume=resume), log)
+        if not cell.summary.is_file():
+            return f"fit ended with {code}: {_last_line(log)}"
+    code = run_command(cell.evaluate_command(), log)
+    return None if code == 0 else f"evaluate ended with {code}: {_last_line(log)}"
+
+
+def _lacks_lpips(cell: Cell) -> bool:
+    splits = json.loads(cell.metrics.read_text("utf-8"))["splits"].values()
+    return cell.options.lpips_weights is not None and any(score["lpips"] is None for score in splits)
+
+
+def _last_line(log: Path) -> str:
+    lines = [line.strip() for line in log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1][:300]
+
+
+def row_of(cell: Cell, failure: str | None) -> Row:
+    """Everything about a cell that the table shows; a failed one has only its reason."""
+    row: Row = {"capture": cell.capture, "preset": cell.preset, "failure": failure}
+    if failure is not None:
+        return row
+    metrics, summary = (json.loads(path.read_text("utf-8")) for path in (cell.metrics, cell.summary))
+    for split in ("val", "test"):
+        score = metrics["splits"].get(split)
+        row[split] = score and {name: score[name] for name in ("psnr", "ssim", "lpips", "lpips_reason")}
+    geometry = metrics["geometry"]
+    row["geometry"] = geometry and {
+        "mean_mm": geometry["mean_mm"],
+        "face_scalp_mm": geometry["regions"].get("face+scalp", {}).get("mean_mm"),
+        "all_mm": geometry["regions"]["all"]["mean_mm"],
+        "flipped_faces": geometry["flipped_faces"],
+        "crossings": geometry["self_intersections"]["fitted"],
+        "new_crossings": geometry["self_intersections"]["added"],
+    }
+    row["gaussians"] = summary["gaussians"]
+    row["iterations"] = {name: stage["iterations"] for name, stage in summary["stages"].items()}
+    return row | {name: summary.get(name) for name in ("seconds", "peak_mib", "peak_cuda_mib")}
+
+
+_COLUMNS: tuple[tuple[str, tuple[str, ...], str], ...] = (
+    *((f"{s} PSNR", (s, "psnr"), ".2f") for s in ("val", "test")),
+    *((f"{s} SSIM", (s, "ssim"), ".4f") for s in ("val", "test")),
+    *((f"{s} LPIPS", (s, "lpips"), ".4f") for s in ("val", "test")),
+    ("mean mm", ("geometry", "mean_mm"), ".2f"),
+    ("face+scalp mm", ("geometry", "face_scalp_mm"), ".2f"),
+    ("all mm", ("geometry", "all_mm"), ".2f"),
+    ("flipped", ("geometry", "flipped_faces"), ",d"),
+    ("crossings", ("geometry", "crossings"), ",d"),
+    ("new crossings", ("geometry", "new_crossings"), ",d"),
+    ("Gaussians", ("gaussians",), ",d"),
+    ("s", ("seconds",), ".0f"),
+    ("MiB", ("peak_mib",), ".0f"),
+)
+
+
+def table(rows: Sequence[Row], options: Options) -> str:
+    """The rows in Markdown; in brackets, how scores and distances differ from the capture's first preset."""
+    budget = f"budget {options.budget}" if options.budget else "no budget"
+    titles = ["capture", "preset", *(title for title, _, _ in _COLUMNS), "iterations"]
+    lines = [f"Seed {options.seed}, {budget}. In brackets: difference to the first preset of the capture.", ""]
+    lines += ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    notes: dict[str, None] = {}
+    for row in rows:
+        first = next(other for other in rows if other["capture"] == row["capture"])
+        cells = [row["capture"], row["preset"]]
+        if row["failure"] is not None:
+            cells += ["failed"] + [""] * len(_COLUMNS)
+            notes[f"{row['capture']}, {row['preset']}: {row['failure']}"] = None
+        else:
+            cells += [_shown(row, first, path, form) for _, path, form in _COLUMNS]
+            cells.append(" + ".join(f"{count:,}" for count in row["iterations"].values()))
+            reasons = (row[split]["lpips_reason"] for split in ("val", "test") if row[split])
+            notes |= {f"LPIPS: {reason}.": None for reason in reasons if reason}
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", *(f"* {note}" for note in notes), ""])
+
+
+def _shown(row: Row, first: Row, path: tuple[str, ...], form: str) -> str:
+    value, reference = _at(row, path), _at(first, path)
+    if value is None:
+        return "–"
+    differs = row is not first and reference is not None and len(path) > 1
+    return f"{value:{form}}" + (f" ({value - reference:+{form}})" if differs else "")
+
+
+def _at(row: Row, path: tuple[str, ...]) -> Any:
+    value: Any = row
+    for key in path:
+        value = value.get(key) if value else None
+    return value
+
+
+def write_table(rows: Sequence[Row], options: Options) -> None:
+    """``table.json`` and ``table.md``."""
+    conditions = {"seed": options.seed, "budget": options.budget, "device": options.device}
+    (options.out / "table.json").write_text(json.dumps({**conditions, "rows": rows}, indent=1) + "\n", "utf-8")
+    (options.out / "table.md").write_text(table(rows, options), "utf-8")
+
+
+def write_sheet(cells: Sequence[Cell], options: Options) -> None:
+    """``sheet.png``: what the finished cells look like."""
+    from ablate_sheet import contact_sheet
+    from PIL import Image
+
+    finished = [cell for cell in cells if cell.metrics.is_file()]
+    captures: dict[Path, list[tuple[str, Path]]] = {}
+    for cell in finished:
+        captures.setdefault(cell.data, []).append((cell.name, cell.run / "avatar.pt"))
+    if captures:
+        Image.fromarray(contact_sheet(captures)).save(options.out / "sheet.png")
+
+
+def ablate(presets: Sequence[str], captures: Sequence[str], options: Options) -> int:
+    """Complete all cells and write what they show; the number of those that failed."""
+    cells = plan_cells(presets, captures, options)
+    options.out.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    for number, cell in enumerate(cells, start=1):
+        print(f"{number}/{len(cells)} {cell.capture}, {cell.preset}", file=sys.stderr, flush=True)
+        failure = complete(cell)
+        if failure is not None:
+            print(f"  {failure}", file=sys.stderr, flush=True)
+        rows.append(row_of(cell, failure))
+        write_table(rows, options)
+    write_sheet(cells, options)
+    return sum(row["failure"] is not None for row in rows)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """0 done, 1 a cell failed or something is missing, 2 the command line is wrong, 130 interrupted."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presets", nargs="+", required=True, help="as in fit; the first is compared with")
+    parser.add_argument("--captures", nargs="+", required=True, metavar="DIR[:HEAD]", help="and their head models")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--budget", help="of each fit, as in fit")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--lpips-weights", type=Path)
+    given = vars(parser.parse_args(argv))
+    try:
+        return min(1, ablate(given.pop("presets"), given.pop("captures"), Options(**given)))
+    except DataError as error:
+        print(f"ablate: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("ablate: interrupted; the same command goes on", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    for number in (signal.SIGINT, signal.SIGTERM):  # SIGINT too: jobs in the background of a script start without it
+        signal.signal(number, signal.default_int_handler)
+    sys.exit(main())

@@ -1,0 +1,160 @@
+"""How far behind the surface Gaussians have to be drawn, from a ball of known radius: a table of docs/geometry.md.
+
+A ball is photographed from a ring of cameras, as a plain disc or with a texture, and vertex-bound Gaussians on an
+icosphere learn its radius (and, on the texture, their colours) from the photometric loss of Eq. 4 alone. No gradient
+passes through the shift, so on a ball it only moves the result: vertices settle at the radius of the Gaussians plus the
+shift.
+
+python tools/calibrate_shift.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from mgavatar.camera import Camera, look_at
+from mgavatar.config import ImageLossConfig, RasterConfig
+from mgavatar.gaussians import Gaussians, draw
+from mgavatar.losses import image_loss
+
+RADIUS = 0.1
+"""Of the ball [m]: a head's."""
+DISTANCE = 1.0
+"""Of the cameras from its middle [m]."""
+SUBDIVISIONS = 4
+"""Of the icosahedron: 2,562 vertices, edges of 6.9 mm."""
+N_CAMERAS = 12
+SHIFTS = (0.0, 1.0, 1.5, 2.0, 2.5)
+LOW_PASS = 0.3
+"""Variance that the rasterizer adds [px^2]."""
+
+Surface = Literal["disc", "texture"]
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the ball showed at one size of Gaussians.
+
+    Attributes:
+        sigma: Of the Gaussians [m].
+        apparent_sigma: The same in the image, with the rasterizer's low pass [m].
+        bias: Converged radius of the Gaussians minus the ball's [m]; negative is inside.
+    """
+
+    sigma: float
+    apparent_sigma: float
+    bias: float
+
+    @property
+    def shift(self) -> float:
+        """Shift that puts the vertices on the ball, in sigmas."""
+        return -self.bias / self.sigma
+
+    def error(self, shift: float) -> float:
+        """Distance of the vertices from the ball at a shift, in sigmas [m]."""
+        return self.bias + shift * self.sigma
+
+
+def mesh() -> tuple[Tensor, float]:
+    """Unit vertices of the icosphere, shape [V, 3], and the mean length of its edges on the ball [m]."""
+    ball = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
+    return torch.tensor(ball.vertices, dtype=torch.float32), RADIUS * float(ball.edges_unique_length.mean())
+
+
+def cameras(focal: float, size: int) -> list[Camera]:
+    """A ring at the height of the ball; ``focal`` and ``size`` in px."""
+    angles = np.linspace(0.0, 2.0 * np.pi, N_CAMERAS, endpoint=False)
+    places = DISTANCE * np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], 1)
+    return [look_at(place, np.zeros(3), focal=focal, width=size, height=size) for place in places]
+
+
+def photograph(camera: Camera, surface: Surface, background: Tensor, samples: int = 4) -> Tensor:
+    """The ball as a camera sees it, exact up to ``samples`` squared rays a pixel; shape [3, H, W]."""
+    steps = (np.arange(samples * camera.width) + 0.5) / samples
+    pixels = np.stack([*np.meshgrid(steps, steps), np.ones((len(steps), len(steps)))], -1)
+    rays = pixels @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    along = -rays @ camera.position
+    under_root = along**2 - (camera.position @ camera.position - RADIUS**2)
+    points = camera.position + (along - np.sqrt(np.maximum(under_root, 0.0)))[..., None] * rays
+    colors = np.where((under_root > 0)[..., None], pattern(points, surface), background.numpy())
+    shape = (camera.height, samples, camera.width, samples, 3)
+    return torch.from_numpy(colors.reshape(shape).mean((1, 3))).permute(2, 0, 1).float().contiguous()
+
+
+def pattern(points: np.ndarray, surface: Surface) -> np.ndarray:
+    """Colours of points on the ball, shape [..., 3]: grey, or waves of 26 mm, which three pixels can show."""
+    if surface == "disc":
+        return np.full(points.shape, 0.4)
+    x, y, z = np.moveaxis(points * (2.0 * np.pi / 0.026), -1, 0)
+    waves = [np.sin(x + 0.4 * y) * np.cos(z), np.sin(y - 0.3 * z) * np.cos(x + 1.0), np.sin(z + 0.2 * x + 2.0)]
+    return 0.5 + 0.3 * np.stack(waves, -1)
+
+
+def calibrate(sigma: float, edge_px: float, surface: Surface, *, iterations: int = 200) -> Calibration:
+    """Fit the radius.
+
+    Args:
+        sigma: Of the Gaussians, in edges.
+        edge_px: Length of an edge in the images [px].
+        surface: What the ball looks like.
+        iterations: One image each.
+    """
+    directions, edge = mesh()
+    focal = edge_px / edge * DISTANCE
+    size = 8 * round(2.6 * RADIUS / DISTANCE * focal / 8)
+    views = cameras(focal, size)
+    background = torch.ones(3)
+    targets = [photograph(view, surface, background) for view in views]
+    radius = torch.tensor(RADIUS, requires_grad=True)
+    colors = torch.tensor(pattern(RADIUS * directions.numpy(), surface), dtype=torch.float32).requires_grad_()
+    optimizer = torch.optim.Adam([{"params": [radius], "lr": 5e-4}, {"params": [colors], "lr": 1e-2}], eps=1e-15)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.01 ** (1.0 / iterations))
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(directions), 1)
+    scales, opacities = torch.full((len(directions), 3), sigma * edge), torch.ones(len(directions))
+    late = []
+    for iteration in range(iterations):
+        view = iteration * 5 % N_CAMERAS  # 5 and 12 have no common factor: every camera, neighbours apart
+        gaussians = Gaussians(radius * directions, quats, scales, opacities, colors)
+        image = draw(gaussians, views[view], background=background, config=RasterConfig()).image
+        optimizer.zero_grad()
+        image_loss(image, targets[view], ImageLossConfig()).backward()
+        optimizer.step()
+        schedule.step()
+        if iteration >= iterations - N_CAMERAS:
+            late.append(float(radius.detach()))
+    pixel = edge / edge_px
+    apparent = float(np.sqrt((sigma * edge) ** 2 + LOW_PASS * pixel**2))
+    return Calibration(sigma * edge, apparent, float(np.mean(late)) - RADIUS)
+
+
+def rows(sigmas: tuple[float, ...], edges_px: tuple[float, ...]) -> list[str]:
+    """The table, line by line."""
+    head = ["sigma / edge", "edge [px]", "surface", "bias [mm]", "shift that cancels it [sigma]", "[apparent sigma]"]
+    head += [f"error at {shift:g} own sigma [mm]" for shift in SHIFTS]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    surfaces: tuple[Surface, ...] = ("disc", "texture")
+    for sigma in sigmas:
+        for edge_px in edges_px:
+            for surface in surfaces:
+                found = calibrate(sigma, edge_px, surface)
+                cells = [f"{sigma:g}", f"{edge_px:g}", surface, f"{1e3 * found.bias:+.2f}", f"{found.shift:.2f}"]
+                cells += [f"{-found.bias / found.apparent_sigma:.2f}"]
+                cells += [f"{1e3 * found.error(shift):+.2f}" for shift in SHIFTS]
+                lines.append("| " + " | ".join(cells) + " |")
+    return lines
+
+
+def main() -> None:
+    """Print the table."""
+    print("\n".join(rows((0.25, 0.35, 0.5), (1.5, 3.0, 6.0))))
+
+
+if __name__ == "__main__":
+    main()
