@@ -106,7 +106,7 @@ class PersonalHead(nn.Module):
 
 
 def _base_offsets(static_offset: np.ndarray | None, n_verts: int) -> np.ndarray | None:
-    """The tracker's offsets [m] for each vertex of the head model, shape [n_verts, 3]; zero where it has none (teeth)."""
+    """The tracker's offsets [m] for each vertex of the head model, shape [n_verts, 3]; zero where it has none."""
     if static_offset is None:
         return None
     offsets = np.zeros((n_verts, 3), np.float32)
