@@ -69,9 +69,6 @@ class GeometryConfig:
     """Learn Phi_id (Eq. 1)."""
     pose_offsets: bool | Literal["auto"] = True
     """Learn Phi_pose (Eq. 2); ``auto`` does so where neck, jaw or eyes move."""
-    pose_offsets_zero_at_rest: bool = False
-    """Take off what Phi_pose says of the pose at rest: both networks see the same features, and what is the same in all
-    poses is then left to Phi_id. The paper has nothing of the kind."""
     learn_jaw: bool | Literal["auto"] = True
     """Refine the jaw's rotations; ``auto`` does so where the jaw moves."""
     learn_eyes: bool | Literal["auto"] = True

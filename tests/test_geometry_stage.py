@@ -125,21 +125,6 @@ def test_pose_offsets_are_the_network_of_features_and_pose():
     assert torch.allclose(net.pose_offsets(features, pose), config.offset_unit * plain, atol=1e-7)
 
 
-def test_pose_offsets_can_be_zero_at_rest():
-    """What Phi_pose says of the pose at rest is taken off: it is nothing there, and the difference elsewhere."""
-    config = tiny_config(geometry={"pose_offsets_zero_at_rest": True}).geometry
-    torch.manual_seed(0)
-    net = RefineNet(torch.rand(30, 3), config)
-    torch.nn.init.normal_(net.phi_pose[-1].weight)
-    features, pose, rest = net.encode(), torch.rand(N_POSE) - 0.5, torch.zeros(N_POSE)
-    assert torch.equal(net.pose_offsets(features, rest), torch.zeros(30, 3))
-    net.zero_at_rest = False
-    by_hand = net.pose_offsets(features, pose) - net.pose_offsets(features, rest)
-    net.zero_at_rest = True
-    assert torch.allclose(net.pose_offsets(features, pose), by_hand, atol=1e-7)
-    assert float(by_hand.detach().abs().max()) > 1e-4
-
-
 def test_offsets_add_up_before_posing(subject):
     """Eq. 3: the posed head is the parametric one plus both offsets, on joints that only identity moves."""
     head = make_stage(subject, tiny_config()).gaussians.head

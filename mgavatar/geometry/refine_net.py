@@ -36,7 +36,6 @@ class RefineNet(nn.Module):
         super().__init__()
         resolution, channels = config.triplane_resolution, config.triplane_channels
         self.unit = config.offset_unit
-        self.zero_at_rest = config.pose_offsets_zero_at_rest
         self.planes = nn.Parameter(0.1 * torch.randn(3, resolution**2, channels))
         self.phi_id = _mlp(3 * channels, config.hidden) if config.identity_offsets else None
         self.phi_pose = _mlp(3 * channels + N_POSE, config.hidden) if config.pose_offsets else None
@@ -63,16 +62,9 @@ class RefineNet(nn.Module):
         """Eq. 2: ``delta mu_pose`` [m] from neck, jaw and eye rotations [12], shape [V, 3]; zero if switched off."""
         if self.phi_pose is None:
             return torch.zeros(len(features), 3, device=features.device)
-        offsets = self._phi_pose(features, pose)
-        if self.zero_at_rest:
-            offsets = offsets - self._phi_pose(features, torch.zeros_like(pose))
-        return self.unit * offsets
-
-    def _phi_pose(self, features: Tensor, pose: Tensor) -> Tensor:
-        assert self.phi_pose is not None  # noqa: S101  for the type checker
         weights, biases = linear_layers(self.phi_pose)
         n = features.shape[1]
         # The pose is the same for all vertices: its share of the first layer is one vector.
         biases[0] = biases[0] + weights[0][:, n:] @ pose
         weights[0] = weights[0][:, :n]
-        return mlp(features, weights, biases)
+        return self.unit * mlp(features, weights, biases)
