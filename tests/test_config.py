@@ -199,7 +199,7 @@ def test_what_the_plan_may_decide_comes_as_flag_and_as_file(tmp_path, monkeypatc
     path = tmp_path / "config.toml"
     path.write_text(to_toml(settled))
     assert 'pose_offsets = "auto"\n' in path.read_text()
-    assert 'learn_jaw = false\n' in path.read_text()
+    assert "learn_jaw = false\n" in path.read_text()
     assert parsed(monkeypatch, "--preset", str(path)) == settled
     flags = ["--geometry.learn-jaw=auto", "--appearance.offset-net.enabled", "true", "--geometry.no-enabled"]
     config = parsed(monkeypatch, "--preset", str(path), *flags, "--appearance.color-net.levels=3")
