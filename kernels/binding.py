@@ -1,4 +1,4 @@
-"""Face frames of a mesh, and Gaussians carried from their face's frame to world space (Eq. 8).
+"""Face frames of a mesh (the R, k and T of Eq. 8), rows gathered in a fixed order, and rotations as quaternions.
 
 The frame of a face: the columns of R are the direction of edge v1 - v0, the normal, and their cross product, so that
 det R = 1; k is the mean of that edge's length and the triangle's height over it; T is the centroid.
@@ -95,30 +95,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         scales[f] = wp.max(half * (length + height), smallest)
         centers[f] = a + (edge + side) * third
 
-    @wp.kernel(module=module)
-    def to_world_kernel(
-        # In:
-        face_quats: wp.array(dtype=vec4),  # [N]
-        face_scales: wp.array(dtype=scalar),  # [N]
-        face_centers: wp.array(dtype=vec3),  # [N]
-        local_means: wp.array(dtype=vec3),  # [N]
-        local_quats: wp.array(dtype=vec4),  # [N]
-        local_scales: wp.array(dtype=vec3),  # [N]
-        # Out:
-        means: wp.array(dtype=vec3),  # [N]
-        quats: wp.array(dtype=vec4),  # [N]
-        scales: wp.array(dtype=vec3),  # [N]
-    ) -> None:
-        n = wp.tid()
-        q = face_quats[n]
-        k = face_scales[n]
-        means[n] = k * rotate(q, local_means[n]) + face_centers[n]
-        quats[n] = quat_product(q, local_quats[n])
-        scales[n] = k * local_scales[n]
-
-    return SimpleNamespace(
-        face_frames=face_frames_kernel, to_world=to_world_kernel, rotate=rotate, quat_product=quat_product
-    )
+    return SimpleNamespace(face_frames=face_frames_kernel, rotate=rotate, quat_product=quat_product)
 
 
 KERNELS = by_dtype(_kernels)
@@ -186,46 +163,3 @@ def face_frames(verts: Tensor, faces: Tensor, *, order: SparseMatrix | None = No
     corners = gather_rows(verts, faces, order=order).reshape(-1, 3, 3)
     n = len(faces)
     return taped(kernels.face_frames, n, (corners,), ((n, 4), (n,), (n, 3)))
-
-
-def to_world(
-    face_quats: Tensor,
-    face_scales: Tensor,
-    face_centers: Tensor,
-    local_means: Tensor,
-    local_quats: Tensor,
-    local_scales: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Carry Gaussians from their face's frame to world space: ``k R mu + T``, ``q_face q``, ``k s`` (Eq. 8).
-
-    Differentiable in everything. Gather the frames of each Gaussian's face first, with :func:`gather_rows`.
-
-    Args:
-        face_quats: Frame of each Gaussian's face, unit quaternions wxyz, shape [N, 4], float32 or float64.
-        face_scales: Scale k of that face [m], shape [N].
-        face_centers: Centroid of that face [m], shape [N, 3].
-        local_means: Centres in units of k, shape [N, 3].
-        local_quats: Rotations wxyz in the face's frame, shape [N, 4]; their length is carried through.
-        local_scales: Standard deviations in units of k, shape [N, 3].
-
-    Returns:
-        Centres [m] [N, 3], rotations wxyz [N, 4] and standard deviations [m] [N, 3].
-
-    Raises:
-        ValueError: If shapes, dtypes or devices do not agree.
-    """
-    tensors = {
-        "face_quats": face_quats,
-        "face_scales": face_scales,
-        "face_centers": face_centers,
-        "local_means": local_means,
-        "local_quats": local_quats,
-        "local_scales": local_scales,
-    }
-    n = len(local_means)
-    shapes = ((n, 4), (n,), (n, 3), (n, 3), (n, 4), (n, 3))
-    for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; {shape} is needed for {n} Gaussians")
-    kernels = pick(KERNELS, **tensors)
-    return taped(kernels.to_world, n, tuple(tensors.values()), ((n, 3), (n, 4), (n, 3)))

@@ -1,6 +1,6 @@
-"""Face-bound Gaussians to world space in one pass: offsets, activations and Eq. 8, with a hand-written adjoint.
+"""Gaussians bound to faces, to the world in one pass: offsets, activations and Eq. 8, with a hand-written adjoint.
 
-What ``binding.to_world`` and a dozen of torch's operations compute, but every number is read and written once.
+What a dozen of torch's operations compute, but every number is read and written once.
 """
 
 from types import SimpleNamespace
@@ -28,6 +28,11 @@ def _kernels(real: Real) -> SimpleNamespace:
     @wp.func
     def conjugate(q: vec4) -> vec4:
         return vec4(q[0], -q[1], -q[2], -q[3])
+
+    @wp.func
+    def place(q: vec4, k: scalar, center: vec3, local: vec3) -> vec3:
+        """The centre of Eq. 8."""
+        return k * rotate(q, local) + center
 
     @wp.kernel(module=module, enable_backward=False)
     def bind_kernel(
@@ -57,7 +62,7 @@ def _kernels(real: Real) -> SimpleNamespace:
             move = vec3(offsets[i], offsets[i + 1], offsets[i + 2])
             color = vec3(offsets[i + 3], offsets[i + 4], offsets[i + 5])
             turn = vec4(one, half * offsets[i + 6], half * offsets[i + 7], half * offsets[i + 8])
-        means[n] = k * rotate(q, local_means[n] + move) + face_centers[f]
+        means[n] = place(q, k, face_centers[f], local_means[n] + move)
         quats[n] = product(q, product(local_quats[n], turn))
         scales[n] = k * local_scales[n]
         colors[n] = color
@@ -142,7 +147,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]
-        means[n] = face_scales[f] * rotate(face_quats[f], local_means[n]) + face_centers[f]
+        means[n] = place(face_quats[f], face_scales[f], face_centers[f], local_means[n])
 
     @wp.kernel(module=module, enable_backward=False)
     def directions_kernel(
@@ -219,7 +224,8 @@ def bind_to_faces(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Carry Gaussians with their offsets from their faces to the world (Eq. 8 to 10). Differentiable in all floats.
 
-    An offset's rotation vector r multiplies the local rotation from the right as the quaternion (1, r / 2).
+    Eq. 8 is ``k R mu + T`` for the centres, ``q_face q`` for the rotations and ``k s`` for the standard deviations. An
+    offset's rotation vector r multiplies the local rotation from the right as the quaternion (1, r / 2).
 
     Args:
         frames: Of all faces: unit quaternions wxyz [F, 4], scales k [m] [F] and centres [m] [F, 3], float32 or float64.

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mgavatar.avatar import Avatar
-from mgavatar.kernels import binding, laplacian, lbs, uv_map
+from mgavatar.kernels import binding, face_bound, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
 from mgavatar.kernels.ssim import compare_images
@@ -333,8 +333,9 @@ def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
     n = len(faces)
     index = faces.long()
     order = binding.gather_matrix(faces, len(verts))
-    local = [_random(n, k, seed=k).to(verts.device).requires_grad_() for k in (3, 4)]
-    scales = torch.rand(n, 3, generator=torch.Generator().manual_seed(0)).to(verts.device).requires_grad_()
+    face_ids = torch.arange(n, device=verts.device)
+    shapes = ((n, 3), (n, 4), (n, 3), (n,))
+    local = [_random(*shape, seed=seed).to(verts.device).requires_grad_() for seed, shape in enumerate(shapes)]
 
     def plain_frames() -> tuple[Tensor, Tensor, Tensor]:
         a, b, c = verts[index].unbind(1)
@@ -345,14 +346,15 @@ def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
         R = torch.stack([edge, normal, third], 2)
         return kornia.geometry.conversions.rotation_matrix_to_quaternion(R), k, (a + b + c) / 3
 
-    def plain_to_world() -> Tensor:
-        k = frames[1][:, None]
-        R = kornia.geometry.conversions.quaternion_to_rotation_matrix(frames[0])
-        w, x, y, z = frames[0].unbind(1)
+    def plain_binding() -> tuple[Tensor, ...]:
+        q, k, center = frames[0][face_ids], frames[1][face_ids, None], frames[2][face_ids]
+        local_means, local_quats, log_scales, logits = local
+        R = kornia.geometry.conversions.quaternion_to_rotation_matrix(q)
+        w, x, y, z = q.unbind(1)
         left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w], 1).reshape(-1, 4, 4)
-        quats = (left @ local[1][:, :, None])[:, :, 0]
-        means = k * (R @ local[0][:, :, None])[:, :, 0] + frames[2]
-        return _sum_of_squares(means, quats, k * scales)
+        quats = (left @ local_quats[:, :, None])[:, :, 0]
+        means = k * (R @ local_means[:, :, None])[:, :, 0] + center
+        return means, quats, k * torch.exp(log_scales), torch.sigmoid(logits)
 
     with torch.no_grad():
         frames = binding.face_frames(verts, faces, order=order)
@@ -366,9 +368,9 @@ def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
     yield Job(
         name="binding",
         work=f"{n // 1000}K Gaussians",
-        step=_autograd(lambda: _sum_of_squares(*binding.to_world(*frames, local[0], local[1], scales))),
-        plain=_autograd(plain_to_world),
-        bytes=2 * 4.0 * n * (8 + 10 + 10),
+        step=_autograd(lambda: _sum_of_squares(*face_bound.bind_to_faces(frames, face_ids, *local)[:4])),
+        plain=_autograd(lambda: _sum_of_squares(*plain_binding())),
+        bytes=2 * (8.0 + 4.0 * (8 + 11 + 11)) * n,
     )
 
 

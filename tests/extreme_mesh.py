@@ -11,7 +11,8 @@ from extreme_cases import Case
 from torch import Tensor
 from twins import mesh as twins
 
-from mgavatar.kernels.binding import face_frames, to_world
+from mgavatar.kernels.binding import face_frames
+from mgavatar.kernels.face_bound import bind_to_faces
 from mgavatar.kernels.hash_encode import hash_encode
 from mgavatar.kernels.hash_grid import HashGridShape
 from mgavatar.kernels.laplacian import laplacian, laplacian_matrix
@@ -179,17 +180,30 @@ def _hash(
     return Case(kernel="hash_encode", name=name, inputs=inputs, op=op, twin=twin)
 
 
-def _world(name: str, factors: tuple[float, ...]) -> Case:
-    shapes = ((20, 4), (20,), (20, 3), (20, 3), (20, 4), (20, 3))
+def _bound(name: str, *, factors: dict[str, float] | None = None, log_scale: float = 0.0, logit: float = 0.0) -> Case:
+    """Twenty Gaussians on seven faces; ``log_scale`` is added to all, ``logit`` to every other one and off the rest."""
+    shapes = {"face_quats": (7, 4), "face_scales": (7,), "face_centers": (7, 3)}
+    shapes |= {"means": (20, 3), "quats": (20, 4), "log_scales": (20, 3), "logits": (20,), "offsets": (20, 13)}
+    scales = {"log_scales": 0.5, "offsets": 0.3} | (factors or {})
+    face_ids = torch.arange(20) % 7
+    signs = torch.tensor([1.0, -1.0], dtype=torch.float64).repeat(10)
 
     def inputs(g: torch.Generator) -> tuple[Tensor, ...]:
-        return _normal(*shapes, factors=(1.0, *factors))(g)
+        draw = _normal(*shapes.values(), factors=tuple(scales.get(key, 1.0) for key in shapes))
+        *others, log_scales, logits, offsets = draw(g)
+        return *others, log_scales + log_scale, logits + logit * signs, offsets
+
+    def op(q: Tensor, k: Tensor, t: Tensor, *local: Tensor) -> Any:
+        return bind_to_faces((q, k, t), face_ids, *local[:4], offsets=local[4])
+
+    def twin(q: Tensor, k: Tensor, t: Tensor, *local: Tensor) -> Any:
+        return twins.bind_to_faces(q, k, t, face_ids, *local)
 
     def of_unit(op: Callable[..., Any]) -> Callable[..., Any]:
         """Faces have unit quaternions: what happens off the sphere is not asked."""
         return lambda q, *rest: op(q / q.norm(dim=1, keepdim=True), *rest)
 
-    return Case(kernel="to_world", name=name, inputs=inputs, op=of_unit(to_world), twin=of_unit(twins.to_world))
+    return Case(kernel="bind_to_faces", name=name, inputs=inputs, op=of_unit(op), twin=of_unit(twin))
 
 
 def _sparse_too_large(_x: Tensor) -> Tensor:
@@ -217,10 +231,13 @@ def _binding_cases() -> list[Case]:
         _collapsed("zero area, three points on a line", line),
         _collapsed("two coincident vertices", coincident),
         _collapsed("three coincident vertices", point),
-        _world("scales 1e6", (1e6, 1.0, 1.0, 1.0, 1e6)),
-        _world("centres at 1e6 m", (1.0, 1e6, 1.0, 1.0, 1.0)),
-        _world("scales 0", (0.0, 1.0, 1.0, 1.0, 0.0)),
-        _world("quaternions of length 1e-10", (1.0, 1.0, 1.0, 1e-10, 1.0)),
+        _bound("scales 1e6", factors={"face_scales": 1e6}, log_scale=math.log(1e6)),
+        _bound("centres at 1e6 m", factors={"face_centers": 1e6}),
+        _bound("scales 0", factors={"face_scales": 0.0}, log_scale=-math.inf),
+        _bound("quaternions of length 1e-10", factors={"quats": 1e-10}),
+        _bound("log-scales of 80", log_scale=80.0, factors={"offsets": 0.0}),
+        _bound("log-scales of -200", log_scale=-200.0),
+        _bound("logits of 200 and -200", logit=200.0),
     ]
 
 

@@ -1,11 +1,11 @@
-"""Face frames, and Gaussians carried from them to world space."""
+"""Face frames, and rows gathered in a fixed order."""
 
 import pytest
 import torch
 from checks import assert_gradcheck, assert_matches_twin, assert_same_bits
 from twins import mesh as twins
 
-from mgavatar.kernels.binding import SMALLEST_SCALE, face_frames, gather_matrix, gather_rows, to_world
+from mgavatar.kernels.binding import SMALLEST_SCALE, face_frames, gather_matrix, gather_rows
 
 
 def triangles(rng, n, *, scale=1.0, at=0.0):
@@ -14,14 +14,6 @@ def triangles(rng, n, *, scale=1.0, at=0.0):
     turns = twins.rotations(2.0 * torch.randn(n, 3, generator=rng).double()).float()
     verts = (base + 0.1 * torch.randn(n, 3, 3, generator=rng)) @ turns.mT + torch.randn(n, 1, 3, generator=rng)
     return (scale * verts.reshape(-1, 3) + at).requires_grad_(), torch.arange(3 * n).reshape(n, 3)
-
-
-def gaussians(rng, n):
-    """Frames of faces and local Gaussians, the quaternions of the latter of any length."""
-    quats = torch.nn.functional.normalize(torch.randn(n, 4, generator=rng).double(), dim=1).float()
-    shapes = ((n,), (n, 3), (n, 3), (n, 4), (n, 3))
-    others = [torch.randn(shape, generator=rng) for shape in shapes]
-    return [x.requires_grad_() for x in (quats, *others)]
 
 
 def frames_as_matrices(verts, faces):
@@ -38,22 +30,6 @@ def test_right_triangle_known_by_hand():
     assert torch.allclose(twins.quat_matrix(quats)[0], expected, atol=1e-6)
     assert scales.item() == pytest.approx(1.5)
     assert torch.allclose(centers[0], torch.tensor([2 / 3, 1 / 3, 0.0]))
-
-
-def test_gaussian_known_by_hand():
-    """A quarter turn about z, twice as large, moved by one along x; the local length of 3 stays."""
-    half = 0.5**0.5
-    means, quats, scales = to_world(
-        torch.tensor([[half, 0.0, 0.0, half]]),
-        torch.tensor([2.0]),
-        torch.tensor([[1.0, 0.0, 0.0]]),
-        torch.tensor([[1.0, 0.0, 0.0]]),
-        torch.tensor([[3.0, 0.0, 0.0, 0.0]]),
-        torch.tensor([[0.1, 0.2, 0.3]]),
-    )
-    assert torch.allclose(means, torch.tensor([[1.0, 2.0, 0.0]]), atol=1e-6)
-    assert torch.allclose(quats, torch.tensor([[3 * half, 0.0, 0.0, 3 * half]]))
-    assert torch.allclose(scales, torch.tensor([[0.2, 0.4, 0.6]]))
 
 
 @pytest.mark.parametrize(("scale", "at"), [(1.0, 0.0), (1e-3, 0.0), (1e6, 0.0)])
@@ -129,15 +105,6 @@ def test_nan_vertices_spoil_only_their_faces(device):
         assert tensor[[0, 2]].isfinite().all()
 
 
-def test_gaussians_match_the_float64_twin(device, rng):
-    """All three outputs and all six gradients; that of a face's quaternion has a meaning along the unit sphere only."""
-
-    def on_sphere(op):
-        return lambda q, *others: op(torch.nn.functional.normalize(q, dim=1), *others)
-
-    assert_matches_twin(on_sphere(to_world), on_sphere(twins.to_world), gaussians(rng, 500), device=device)
-
-
 def test_gathered_rows_match_the_float64_twin(device, rng):
     """Rows that are taken often, once and never."""
     index = torch.cat([torch.zeros(5000, dtype=torch.long), torch.randint(1, 90, (300,), generator=rng)])
@@ -148,10 +115,9 @@ def test_gathered_rows_match_the_float64_twin(device, rng):
 
 
 def test_float64_gradients_match_finite_differences(rng):
-    """The adjoints of the float64 builds, through frames and means together."""
+    """The adjoint of the float64 build."""
     verts, faces = triangles(rng, 5)
     assert_gradcheck(lambda v: face_frames(v, faces), verts)
-    assert_gradcheck(to_world, *gaussians(rng, 4))
 
 
 def test_same_bits_for_any_number_of_threads(device, rng):
@@ -159,18 +125,16 @@ def test_same_bits_for_any_number_of_threads(device, rng):
     faces = torch.randint(50, (2000, 3), generator=rng).to(device)
     verts = torch.randn(50, 3, generator=rng).requires_grad_()
     assert_same_bits(lambda v: face_frames(v, faces), (verts,), device=device)
-    assert_same_bits(to_world, gaussians(rng, 3000), device=device)
 
 
-def test_nothing_is_bound_to_nothing():
-    """No faces and no Gaussians."""
+def test_no_faces_have_no_frames():
+    """Empty in, empty out."""
     quats, scales, _ = face_frames(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long))
     assert (quats.shape, scales.shape) == ((0, 4), (0,))
-    assert to_world(*(torch.zeros(s) for s in ((0, 4), (0,), (0, 3), (0, 3), (0, 4), (0, 3))))[1].shape == (0, 4)
 
 
 def test_bad_input_is_refused(rng):
-    """Shapes, index ranges, dtypes."""
+    """Shapes and index ranges."""
     verts, faces = triangles(rng, 2)
     with pytest.raises(ValueError, match="index"):
         face_frames(verts, faces + 4)
@@ -178,8 +142,3 @@ def test_bad_input_is_refused(rng):
         face_frames(verts, faces[:, :2])
     with pytest.raises(ValueError, match="order has shape"):
         face_frames(verts, faces, order=gather_matrix(faces, 7))
-    inputs = gaussians(rng, 3)
-    with pytest.raises(ValueError, match="face_scales has shape"):
-        to_world(inputs[0], inputs[1][:2], *inputs[2:])
-    with pytest.raises(ValueError, match="local_scales is torch"):
-        to_world(*inputs[:5], inputs[5].double())

@@ -55,6 +55,26 @@ def test_a_gaussian_by_hand(device):
     assert place_on_faces(frames, face_ids, local[0])[0].tolist() == pytest.approx([10.0, 22.0, 30.0], abs=1e-5)
 
 
+def test_the_length_of_a_local_quaternion_is_carried_through(device):
+    """A quarter turn about z, twice as large, moved by one along x; the local length of 3 stays."""
+    half = 0.5**0.5
+    frames = (
+        torch.tensor([[half, 0.0, 0.0, half]], device=device),
+        torch.tensor([2.0], device=device),
+        torch.tensor([[1.0, 0.0, 0.0]], device=device),
+    )
+    local = (
+        torch.tensor([[1.0, 0.0, 0.0]], device=device),
+        torch.tensor([[3.0, 0.0, 0.0, 0.0]], device=device),
+        torch.tensor([[0.1, 0.2, 0.3]], device=device).log(),
+        torch.zeros(1, device=device),
+    )
+    means, quats, scales, *_ = bind_to_faces(frames, torch.zeros(1, dtype=torch.long, device=device), *local)
+    assert means[0].tolist() == pytest.approx([1.0, 2.0, 0.0], abs=1e-6)
+    assert quats[0].tolist() == pytest.approx([3 * half, 0.0, 0.0, 3 * half])
+    assert scales[0].tolist() == pytest.approx([0.2, 0.4, 0.6])
+
+
 def test_outputs_and_gradients_match_the_float64_twin(device, rng):
     """Five outputs; eight gradients, those of the frames along the unit sphere only and summed over their Gaussians."""
 
@@ -129,6 +149,8 @@ def test_bad_input_is_refused(rng):
         bind_to_faces((q, k, t), face_ids, local[0], local[0], *local[2:4])
     with pytest.raises(ValueError, match="offsets has shape"):
         bind_to_faces((q, k, t), face_ids, *local[:4], offsets=local[4][:3])
+    with pytest.raises(ValueError, match="face_quats has shape"):
+        bind_to_faces((q[:7], k, t), face_ids, *local[:4])
     with pytest.raises(ValueError, match="face_centers has shape"):
         bind_to_faces((q, k, t[:7]), face_ids, *local[:4])
     with pytest.raises(ValueError, match="log_scales is torch"):

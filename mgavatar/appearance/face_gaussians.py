@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.config import AppearanceConfig
-from mgavatar.kernels.binding import face_frames, to_world
+from mgavatar.kernels.binding import face_frames
 from mgavatar.kernels.face_bound import place_on_faces
 
 PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
@@ -41,10 +41,6 @@ class FaceFrames:
     def all(self) -> tuple[Tensor, Tensor, Tensor]:
         """Frames of all faces, as the kernels take them."""
         return self.quats, self.scales, self.centers
-
-    def at(self, face_ids: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Frames of chosen faces."""
-        return self.quats[face_ids], self.scales[face_ids], self.centers[face_ids]
 
 
 class FaceGaussians(nn.Module):
@@ -107,8 +103,7 @@ def face_uvs(
         Shape [N, 2].
     """
     with torch.no_grad():
-        ones = torch.ones_like(local_means)
-        points = to_world(*frames.at(face_ids), local_means, frames.quats[face_ids], ones)[0]
+        points = place_on_faces(frames.all, face_ids, local_means)
         a, b, c = verts[faces.long()[face_ids]].unbind(1)
         e1, e2, d = b - a, c - a, points - a
         d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)

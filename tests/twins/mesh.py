@@ -74,16 +74,6 @@ def face_frames(verts: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return torch.stack([edge, normal, third], 2), scales, (a + b + c) / 3
 
 
-def to_world(
-    q: Tensor, k: Tensor, t: Tensor, means: Tensor, quats: Tensor, scales: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """``k R mu + T``, the product of the quaternions as a matrix times a vector, and ``k s``."""
-    w, x, y, z = q.unbind(1)
-    left = torch.stack([w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w], 1).reshape(-1, 4, 4)
-    turned = (quat_matrix(q) @ means[:, :, None])[:, :, 0]
-    return k[:, None] * turned + t, (left @ quats[:, :, None])[:, :, 0], k[:, None] * scales
-
-
 def uv_cover(vt: Tensor, ft: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
     """First face over each texel centre, -1 for none [H, W], and its barycentric weights [H, W, 3]."""
     ids = torch.full((height, width), -1, dtype=torch.int32)
