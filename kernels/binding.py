@@ -1,165 +1,299 @@
-"""Face frames of a mesh (the R, k and T of Eq. 8), rows gathered in a fixed order, and rotations as quaternions.
+"""Gaussians bound to faces, to the world in one pass: offsets, activations and Eq. 8, with a hand-written adjoint.
 
-The frame of a face: the columns of R are the direction of edge v1 - v0, the normal, and their cross product, so that
-det R = 1; k is the mean of that edge's length and the triangle's height over it; T is the centroid.
+What a dozen of torch's operations compute, but every number is read and written once.
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 import warp as wp
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from mgavatar.kernels.bridge import taped
+from mgavatar.kernels import face_frames
+from mgavatar.kernels.bridge import launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype, pick
-from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
-SMALLEST_SCALE = 1e-8
-"""Least scale of a face [m]: a collapsed face still has a finite covariance whose inverse fits float32."""
-
-_FLAT = 1e-5  # height over the longest edge at which float32 positions no longer say where the normal points
-_TINY = 1e-18  # length [m] below which an edge has no direction; its square is a normal float32
+N_OFFSETS = 13
+"""Columns of the offsets: position 3, colour 3, rotation vector 3, log-scale 3, opacity logit 1."""
 
 
 def _kernels(real: Real) -> SimpleNamespace:
     scalar, vec3, vec4 = real.scalar, real.vec3, real.vec4
-    zero, half, one, two, third = scalar(0.0), scalar(0.5), scalar(1.0), scalar(2.0), scalar(1.0 / 3.0)
-    flat, tiny, smallest = scalar(_FLAT), scalar(_TINY), scalar(SMALLEST_SCALE)
+    zero, half, one, two = scalar(0.0), scalar(0.5), scalar(1.0), scalar(2.0)
     module = f"{__name__}.{real.name}"
+    rotate, product = face_frames.KERNELS[real.dtype].rotate, face_frames.KERNELS[real.dtype].quat_product
 
     @wp.func
-    def any_normal(direction: vec3) -> vec3:
-        """A unit vector at right angles to a unit ``direction``."""
-        helper = vec3(one, zero, zero)
-        if wp.abs(direction[0]) > half:
-            helper = vec3(zero, one, zero)
-        return wp.normalize(wp.cross(direction, helper))
+    def conjugate(q: vec4) -> vec4:
+        return vec4(q[0], -q[1], -q[2], -q[3])
 
     @wp.func
-    def quat_of_axes(x: vec3, y: vec3, z: vec3) -> vec4:
-        """Quaternion wxyz of the rotation with these columns, of which no component is divided by a small number."""
-        trace = x[0] + y[1] + z[2]
-        q = vec4(one + trace, y[2] - z[1], z[0] - x[2], x[1] - y[0])
-        if trace < zero:
-            if x[0] >= y[1] and x[0] >= z[2]:
-                q = vec4(y[2] - z[1], one + x[0] - y[1] - z[2], x[1] + y[0], x[2] + z[0])
-            elif y[1] >= z[2]:
-                q = vec4(z[0] - x[2], x[1] + y[0], one + y[1] - x[0] - z[2], y[2] + z[1])
-            else:
-                q = vec4(x[1] - y[0], x[2] + z[0], y[2] + z[1], one + z[2] - x[0] - y[1])
-        return q / wp.length(q)
+    def place(q: vec4, k: scalar, center: vec3, local: vec3) -> vec3:
+        """The centre of Eq. 8."""
+        return k * rotate(q, local) + center
 
-    @wp.func
-    def rotate(q: vec4, v: vec3) -> vec3:
-        """Rotate ``v`` by a unit quaternion wxyz."""
-        axis = vec3(q[1], q[2], q[3])
-        t = two * wp.cross(axis, v)
-        return v + q[0] * t + wp.cross(axis, t)
-
-    @wp.func
-    def quat_product(p: vec4, q: vec4) -> vec4:
-        """Hamilton product of quaternions wxyz."""
-        return vec4(
-            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-        )
-
-    @wp.kernel(module=module)
-    def face_frames_kernel(
+    @wp.kernel(module=module, enable_backward=False)
+    def bind_kernel(
+        first: int,
         # In:
-        corners: wp.array2d(dtype=vec3),  # [F, 3]
+        face_quats: wp.array(dtype=vec4),  # [F]
+        face_scales: wp.array(dtype=scalar),  # [F]
+        face_centers: wp.array(dtype=vec3),  # [F]
+        face_ids: wp.array(dtype=wp.int64),  # [N]
+        local_means: wp.array(dtype=vec3),  # [N]
+        local_quats: wp.array(dtype=vec4),  # [N]
+        local_scales: wp.array(dtype=vec3),  # [N]
+        offsets: wp.array(dtype=scalar),  # [13 N] or empty
         # Out:
-        quats: wp.array(dtype=vec4),  # [F]
-        scales: wp.array(dtype=scalar),  # [F]
-        centers: wp.array(dtype=vec3),  # [F]
+        means: wp.array(dtype=vec3),  # [N]
+        quats: wp.array(dtype=vec4),  # [N]
+        scales: wp.array(dtype=vec3),  # [N]
+        colors: wp.array(dtype=vec3),  # [N]
     ) -> None:
-        f = wp.tid()
-        a = corners[f, 0]
-        edge = corners[f, 1] - a
-        side = corners[f, 2] - a
-        x = vec3(one, zero, zero)
-        y = vec3(zero, one, zero)
-        length = zero
-        height = zero
-        if wp.dot(edge, edge) > tiny * tiny:
-            length = wp.length(edge)
-            x = edge / length
-            y = any_normal(x)
-            upright = side - wp.dot(side, x) * x
-            if wp.dot(upright, upright) > flat * flat * wp.max(wp.dot(side, side), wp.dot(edge, edge)):
-                height = wp.length(upright)
-                y = wp.cross(x, upright) / height
-        quats[f] = quat_of_axes(x, y, wp.cross(x, y))
-        scales[f] = wp.max(half * (length + height), smallest)
-        centers[f] = a + (edge + side) * third
+        n = first + wp.tid()
+        f = face_ids[n]
+        q = face_quats[f]
+        k = face_scales[f]
+        move, color, turn = vec3(), vec3(), vec4(one, zero, zero, zero)
+        i = 13 * n
+        if offsets.shape[0] > 0:
+            move = vec3(offsets[i], offsets[i + 1], offsets[i + 2])
+            color = vec3(offsets[i + 3], offsets[i + 4], offsets[i + 5])
+            turn = vec4(one, half * offsets[i + 6], half * offsets[i + 7], half * offsets[i + 8])
+        means[n] = place(q, k, face_centers[f], local_means[n] + move)
+        quats[n] = product(q, product(local_quats[n], turn))
+        scales[n] = k * local_scales[n]
+        colors[n] = color
 
-    return SimpleNamespace(face_frames=face_frames_kernel, rotate=rotate, quat_product=quat_product)
+    @wp.kernel(module=module, enable_backward=False)
+    def bind_bwd_kernel(
+        first: int,
+        # In:
+        face_quats: wp.array(dtype=vec4),  # [F]
+        face_scales: wp.array(dtype=scalar),  # [F]
+        face_ids: wp.array(dtype=wp.int64),  # [N]
+        local_means: wp.array(dtype=vec3),  # [N]
+        local_quats: wp.array(dtype=vec4),  # [N]
+        local_scales: wp.array(dtype=vec3),  # [N]
+        opacities: wp.array(dtype=scalar),  # [N]
+        offsets: wp.array(dtype=scalar),  # [13 N] or empty
+        v_means: wp.array(dtype=vec3),  # [N]
+        v_quats: wp.array(dtype=vec4),  # [N]
+        v_scales: wp.array(dtype=vec3),  # [N]
+        v_opacities: wp.array(dtype=scalar),  # [N]
+        v_colors: wp.array(dtype=vec3),  # [N]
+        # Out:
+        v_local_means: wp.array(dtype=vec3),  # [N]
+        v_local_quats: wp.array(dtype=vec4),  # [N]
+        v_log_scales: wp.array(dtype=vec3),  # [N]
+        v_logits: wp.array(dtype=scalar),  # [N]
+        v_offsets: wp.array(dtype=scalar),  # [13 N] or empty
+        v_frames: wp.array2d(dtype=scalar),  # [N, 8] share of each Gaussian: quaternion, scale, centre; or empty
+    ) -> None:
+        n = first + wp.tid()
+        f = face_ids[n]
+        q = face_quats[f]
+        k = face_scales[f]
+        move, turn = vec3(), vec4(one, zero, zero, zero)
+        i = 13 * n
+        if offsets.shape[0] > 0:
+            move = vec3(offsets[i], offsets[i + 1], offsets[i + 2])
+            turn = vec4(one, half * offsets[i + 6], half * offsets[i + 7], half * offsets[i + 8])
+        s = local_scales[n]
+        o = opacities[n]
+        v_mean = k * rotate(conjugate(q), v_means[n])
+        v_q = product(conjugate(q), v_quats[n])
+        v_turn = product(conjugate(local_quats[n]), v_q)
+        v_scale = k * wp.cw_mul(s, v_scales[n])
+        v_logit = o * (one - o) * v_opacities[n]
+        v_local_means[n] = v_mean
+        v_local_quats[n] = product(v_q, conjugate(turn))
+        v_log_scales[n] = v_scale
+        v_logits[n] = v_logit
+        if v_offsets.shape[0] > 0:
+            v_color = v_colors[n]
+            for c in range(3):
+                v_offsets[i + c] = v_mean[c]
+                v_offsets[i + 3 + c] = v_color[c]
+                v_offsets[i + 6 + c] = half * v_turn[c + 1]
+                v_offsets[i + 9 + c] = v_scale[c]
+            v_offsets[i + 12] = v_logit
+        if v_frames.shape[0] > 0:
+            g = v_means[n]
+            p = local_means[n] + move
+            a = vec3(q[1], q[2], q[3])
+            v_w = two * k * wp.dot(g, wp.cross(a, p))
+            v_a = two * k * (q[0] * wp.cross(p, g) + wp.dot(a, p) * g + wp.dot(g, a) * p - two * wp.dot(g, p) * a)
+            v_face = product(v_quats[n], conjugate(product(local_quats[n], turn)))
+            v_frames[n, 0] = v_face[0] + v_w
+            for c in range(3):
+                v_frames[n, 1 + c] = v_face[1 + c] + v_a[c]
+                v_frames[n, 5 + c] = g[c]
+            v_frames[n, 4] = wp.dot(g, rotate(q, p)) + wp.dot(v_scales[n], s)
+
+    @wp.kernel(module=module, enable_backward=False)
+    def place_kernel(
+        first: int,
+        # In:
+        face_quats: wp.array(dtype=vec4),  # [F]
+        face_scales: wp.array(dtype=scalar),  # [F]
+        face_centers: wp.array(dtype=vec3),  # [F]
+        face_ids: wp.array(dtype=wp.int64),  # [N]
+        local_means: wp.array(dtype=vec3),  # [N]
+        # Out:
+        means: wp.array(dtype=vec3),  # [N]
+    ) -> None:
+        n = first + wp.tid()
+        f = face_ids[n]
+        means[n] = place(face_quats[f], face_scales[f], face_centers[f], local_means[n])
+
+    @wp.kernel(module=module, enable_backward=False)
+    def directions_kernel(
+        first: int,
+        # In:
+        means: wp.array(dtype=vec3),  # [N]
+        position: wp.array(dtype=vec3),  # [1]
+        face_ids: wp.array(dtype=wp.int64),  # [N]
+        from_quats: wp.array(dtype=vec4),  # [F]
+        to_quats: wp.array(dtype=vec4),  # [F]
+        # Out:
+        directions: wp.array(dtype=vec3),  # [N]
+    ) -> None:
+        n = first + wp.tid()
+        f = face_ids[n]
+        away = means[n] - position[0]
+        along = away / wp.max(wp.length(away), scalar(1e-12))
+        directions[n] = rotate(to_quats[f], rotate(conjugate(from_quats[f]), along))
+
+    return SimpleNamespace(bind=bind_kernel, bind_bwd=bind_bwd_kernel, place=place_kernel, directions=directions_kernel)
 
 
-KERNELS = by_dtype(_kernels)
+_KERNELS = by_dtype(_kernels)
 
 
-def gather_matrix(index: Tensor, n_rows: int) -> SparseMatrix:
-    """Prepare :func:`gather_rows` for an index that is used again and again.
+class _Bind(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, face_ids: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        face_quats, face_scales, face_centers, means, quats, log_scales, logits, offsets = tensors
+        n = len(face_ids)
+        # Exponentials are left to torch, whose are vectors.
+        more = offsets.split([9, 3, 1], dim=1) if len(offsets) else None
+        scales = torch.exp(log_scales + more[1] if more else log_scales)
+        opacities = torch.sigmoid(logits + more[2][:, 0] if more else logits)
+        outputs = tuple(means.new_empty(n, k) for k in (3, 4, 3, 3))
+        if n:
+            inputs = (face_quats, face_scales, face_centers, face_ids, means, quats, scales, offsets.reshape(-1))
+            launch_ranges(_KERNELS[means.dtype].bind, n, inputs, outputs, ranges_per_thread=1)
+        ctx.save_for_backward(face_quats, face_scales, face_ids, means, quats, scales, opacities, offsets)
+        return *outputs[:3], opacities, outputs[3]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v_outputs: Tensor) -> Any:
+        _, face_scales, face_ids, *local, offsets = ctx.saved_tensors
+        n = len(face_ids)
+        v_local = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in local]
+        v_offsets = offsets.new_empty(offsets.shape)
+        wants_frames = any(ctx.needs_input_grad[1:4])
+        shares = offsets.new_empty(n if wants_frames else 0, 8)
+        if n:
+            outputs = (*v_local, v_offsets.view(-1), shares)
+            inputs = (*ctx.saved_tensors[:-1], offsets.reshape(-1), *v_outputs)
+            launch_ranges(_KERNELS[offsets.dtype].bind_bwd, n, inputs, outputs, ranges_per_thread=1)
+        v_frames = _by_face(shares, face_ids, len(face_scales)) if wants_frames else (None, None, None)
+        return None, *v_frames, *v_local, v_offsets
+
+
+def _by_face(shares: Tensor, face_ids: Tensor, n_faces: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Sums of the Gaussians' shares of their faces' quaternions, scales and centres, in a fixed order."""
+    sums = shares.new_zeros(n_faces, 8).index_put_((face_ids,), shares, accumulate=True)
+    return sums[:, :4].contiguous(), sums[:, 4].contiguous(), sums[:, 5:].contiguous()
+
+
+def bind_to_faces(
+    frames: tuple[Tensor, Tensor, Tensor],
+    face_ids: Tensor,
+    local_means: Tensor,
+    local_quats: Tensor,
+    log_scales: Tensor,
+    opacity_logits: Tensor,
+    *,
+    offsets: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Carry Gaussians with their offsets from their faces to the world (Eq. 8 to 10). Differentiable in all floats.
+
+    Eq. 8 is ``k R mu + T`` for the centres, ``q_face q`` for the rotations and ``k s`` for the standard deviations. An
+    offset's rotation vector r multiplies the local rotation from the right as the quaternion (1, r / 2).
 
     Args:
-        index: Row that each output takes, any shape, N elements, integers.
-        n_rows: Number of rows M that it takes from.
+        frames: Of all faces: unit quaternions wxyz [F, 4], scales k [m] [F] and centres [m] [F, 3], float32 or float64.
+        face_ids: Face of each Gaussian, shape [N], int64.
+        local_means: Centres in units of k, shape [N, 3].
+        local_quats: Rotations wxyz in the face's frame, shape [N, 4]; their length is carried through.
+        log_scales: Logarithms of standard deviations in units of k, shape [N, 3].
+        opacity_logits: Shape [N].
+        offsets: What is added, columns as :data:`N_OFFSETS` says, shape [N, 13]; nothing by default.
 
     Returns:
-        The matrix, shape [N, M], on the device of ``index``.
+        Centres [m] [N, 3], rotations wxyz [N, 4], standard deviations [m] [N, 3], opacities [N], and the offsets'
+        colours [N, 3], zero without offsets.
 
     Raises:
-        ValueError: If an index is outside the rows.
+        ValueError: If shapes, dtypes or devices do not agree.
     """
-    flat = index.reshape(-1)
-    ones = torch.ones(len(flat), dtype=torch.float32, device=index.device)
-    return SparseMatrix.from_coo(torch.arange(len(flat), device=index.device), flat, ones, (len(flat), n_rows))
+    n = len(face_ids)
+    offsets = local_means.new_empty(0, N_OFFSETS) if offsets is None else offsets
+    tensors = {
+        "face_quats": frames[0], "face_scales": frames[1], "face_centers": frames[2], "local_means": local_means,
+        "local_quats": local_quats, "log_scales": log_scales, "opacity_logits": opacity_logits, "offsets": offsets,
+    }  # fmt: skip
+    n_faces = len(frames[1])
+    shapes = ((n_faces, 4), (n_faces,), (n_faces, 3), (n, 3), (n, 4), (n, 3), (n,), (len(offsets) and n, N_OFFSETS))
+    for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} has shape {tuple(tensor.shape)}; {shape} is needed for {n} Gaussians")
+    pick(_KERNELS, **tensors)
+    return _Bind.apply(face_ids, *tensors.values())
 
 
-def gather_rows(x: Tensor, index: Tensor, *, order: SparseMatrix | None = None) -> Tensor:
-    """Take rows of ``x``; the adjoint adds up gradients in a fixed order. Differentiable in ``x``.
+def place_on_faces(frames: tuple[Tensor, Tensor, Tensor], face_ids: Tensor, local_means: Tensor) -> Tensor:
+    """Centres alone: ``k R mu + T`` (Eq. 8). No gradient.
 
     Args:
-        x: Values, shape [M, ...], float32 or float64.
-        index: Rows to take, shape [N], integers.
-        order: :func:`gather_matrix` of ``index``; without it, it is prepared on every call.
+        frames: As in :func:`bind_to_faces`.
+        face_ids: Shape [N], int64.
+        local_means: In units of k, shape [N, 3].
 
     Returns:
-        ``x[index]``, shape [N, ...].
-
-    Raises:
-        ValueError: If an index is outside the rows, or ``order`` was made for another number of rows.
+        Centres [m], shape [N, 3].
     """
-    order = gather_matrix(index, len(x)) if order is None else order
-    if order.shape != (index.numel(), len(x)):
-        raise ValueError(f"order has shape {order.shape} but {index.numel()} rows are taken from {len(x)}")
-    return sparse_apply(order, x)
+    kernels = pick(_KERNELS, local_means=local_means, face_quats=frames[0])
+    out = local_means.new_empty(local_means.shape)
+    if len(face_ids):
+        launch_ranges(kernels.place, len(face_ids), (*frames, face_ids, local_means), (out,), ranges_per_thread=1)
+    return out
 
 
-def face_frames(verts: Tensor, faces: Tensor, *, order: SparseMatrix | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Frames of all faces, the R, k and T of Eq. 8. Differentiable in ``verts``.
-
-    A face whose height is less than 1e-5 of its longest edge has no usable normal in float32: its frame keeps the
-    edge and takes any normal; one whose edge has no length is not rotated. Neither passes a gradient through what it
-    replaced, so gradients stay finite.
+def directions_on_faces(
+    means: Tensor, position: Tensor, face_ids: Tensor, from_quats: Tensor, to_quats: Tensor
+) -> Tensor:
+    """Directions from a point to Gaussians, carried from one frame of their faces to another. No gradient.
 
     Args:
-        verts: Vertices [m], shape [V, 3], float32 or float64.
-        faces: Vertex indices, shape [F, 3], integers.
-        order: :func:`gather_matrix` of ``faces``; without it, it is prepared on every call.
+        means: Centres [m], shape [N, 3].
+        position: The point [m], shape [3].
+        face_ids: Shape [N], int64.
+        from_quats: Frames in which means and position are, unit quaternions wxyz, shape [F, 4].
+        to_quats: Frames to carry the directions to, shape [F, 4].
 
     Returns:
-        Rotations as unit quaternions wxyz [F, 4], scales k [m] [F], at least 1e-8, and centroids [m] [F, 3].
-
-    Raises:
-        ValueError: If a shape is wrong or a face points outside the vertices.
+        Unit directions, shape [N, 3].
     """
-    if verts.ndim != 2 or verts.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(f"verts must be [V, 3] and faces [F, 3], got {tuple(verts.shape)} and {tuple(faces.shape)}")
-    kernels = pick(KERNELS, verts=verts)
-    corners = gather_rows(verts, faces, order=order).reshape(-1, 3, 3)
-    n = len(faces)
-    return taped(kernels.face_frames, n, (corners,), ((n, 4), (n,), (n, 3)))
+    kernels = pick(_KERNELS, means=means, position=position, from_quats=from_quats, to_quats=to_quats)
+    out = means.new_empty(means.shape)
+    if len(face_ids):
+        inputs = (means, position[None], face_ids, from_quats, to_quats)
+        launch_ranges(kernels.directions, len(face_ids), inputs, (out,), ranges_per_thread=1)
+    return out

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mgavatar.avatar import Avatar
-from mgavatar.kernels import binding, face_bound, laplacian, lbs, uv_map
+from mgavatar.kernels import binding, face_frames, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
 from mgavatar.kernels.ssim import compare_images
@@ -332,7 +332,7 @@ def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
     """Frames of the faces, and Gaussians carried into them; once the mesh is frozen, only the second has an adjoint."""
     n = len(faces)
     index = faces.long()
-    order = binding.gather_matrix(faces, len(verts))
+    order = face_frames.gather_matrix(faces, len(verts))
     face_ids = torch.arange(n, device=verts.device)
     shapes = ((n, 3), (n, 4), (n, 3), (n,))
     local = [_random(*shape, seed=seed).to(verts.device).requires_grad_() for seed, shape in enumerate(shapes)]
@@ -357,18 +357,18 @@ def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
         return means, quats, k * torch.exp(log_scales), torch.sigmoid(logits)
 
     with torch.no_grad():
-        frames = binding.face_frames(verts, faces, order=order)
+        frames = face_frames.face_frames(verts, faces, order=order)
     yield Job(
         name="face frames",
         work=f"{n // 1000}K faces",
-        step=_autograd(lambda: _sum_of_squares(*binding.face_frames(verts, faces, order=order))),
+        step=_autograd(lambda: _sum_of_squares(*face_frames.face_frames(verts, faces, order=order))),
         plain=_autograd(lambda: _sum_of_squares(*plain_frames())),
         bytes=2 * 4.0 * n * (9 + 8),
     )
     yield Job(
         name="binding",
         work=f"{n // 1000}K Gaussians",
-        step=_autograd(lambda: _sum_of_squares(*face_bound.bind_to_faces(frames, face_ids, *local)[:4])),
+        step=_autograd(lambda: _sum_of_squares(*binding.bind_to_faces(frames, face_ids, *local)[:4])),
         plain=_autograd(lambda: _sum_of_squares(*plain_binding())),
         bytes=2 * (8.0 + 4.0 * (8 + 11 + 11)) * n,
     )

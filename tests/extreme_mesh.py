@@ -11,8 +11,8 @@ from extreme_cases import Case
 from torch import Tensor
 from twins import mesh as twins
 
-from mgavatar.kernels.binding import face_frames
-from mgavatar.kernels.face_bound import bind_to_faces
+from mgavatar.kernels.binding import bind_to_faces
+from mgavatar.kernels.face_frames import face_frames
 from mgavatar.kernels.hash_encode import hash_encode
 from mgavatar.kernels.hash_grid import HashGridShape
 from mgavatar.kernels.laplacian import laplacian, laplacian_matrix

@@ -1,144 +1,157 @@
-"""Face frames, and rows gathered in a fixed order."""
+"""Face-bound Gaussians carried to the world in one pass: values by hand, the float64 twin, refusals."""
+
+from __future__ import annotations
 
 import pytest
 import torch
 from checks import assert_gradcheck, assert_matches_twin, assert_same_bits
+from torch.nn.functional import normalize
 from twins import mesh as twins
 
-from mgavatar.kernels.binding import SMALLEST_SCALE, face_frames, gather_matrix, gather_rows
+from mgavatar.kernels.binding import bind_to_faces, directions_on_faces, place_on_faces
 
 
-def triangles(rng, n, *, scale=1.0, at=0.0):
-    """A soup of triangles, all of a decent shape, as vertices and faces."""
-    base = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0], [0.3, 1.0, 0.2]])
-    turns = twins.rotations(2.0 * torch.randn(n, 3, generator=rng).double()).float()
-    verts = (base + 0.1 * torch.randn(n, 3, 3, generator=rng)) @ turns.mT + torch.randn(n, 1, 3, generator=rng)
-    return (scale * verts.reshape(-1, 3) + at).requires_grad_(), torch.arange(3 * n).reshape(n, 3)
+def scene(rng, n, n_faces=40):
+    """Frames, faces and local parameters with offsets, all of which want gradients."""
+
+    def draw(*shape, scale=1.0):
+        return scale * torch.randn(*shape, generator=rng)
+
+    frames = normalize(draw(n_faces, 4), dim=1), 0.01 + 0.02 * draw(n_faces).abs(), draw(n_faces, 3)
+    face_ids = torch.randint(n_faces, (n,), generator=rng)
+    local = draw(n, 3), draw(n, 4), draw(n, 3, scale=0.5), draw(n), draw(n, 13, scale=0.3)
+    return (*(t.requires_grad_() for t in frames), face_ids, *(t.requires_grad_() for t in local))
 
 
-def frames_as_matrices(verts, faces):
-    """Face frames with the quaternion turned into a matrix, whose sign has no meaning."""
-    quats, scales, centers = face_frames(verts, faces)
-    return twins.quat_matrix(quats), scales, centers
+def bound(q, k, t, face_ids, *local):
+    """The op with its arguments in the twin's order."""
+    return bind_to_faces((q, k, t), face_ids.to(q.device), *local[:4], offsets=local[4])
 
 
-def test_right_triangle_known_by_hand():
-    """Edge along x, normal along z: columns x, z, x times z; k the mean of 2 and 1."""
-    verts = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    quats, scales, centers = face_frames(verts, torch.tensor([[0, 1, 2]]))
-    expected = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    assert torch.allclose(twins.quat_matrix(quats)[0], expected, atol=1e-6)
-    assert scales.item() == pytest.approx(1.5)
-    assert torch.allclose(centers[0], torch.tensor([2 / 3, 1 / 3, 0.0]))
-
-
-@pytest.mark.parametrize(("scale", "at"), [(1.0, 0.0), (1e-3, 0.0), (1e6, 0.0)])
-def test_frames_match_the_float64_twin(device, rng, scale, at):
-    """Random rotations reach all four branches of the quaternion; sizes from a millimetre to 1e6."""
-    verts, faces = triangles(rng, 400, scale=scale, at=at)
-    assert_matches_twin(
-        lambda v: frames_as_matrices(v, faces.to(v.device)),
-        lambda v: twins.face_frames(v, faces),
-        (verts,),
-        device=device,
+def test_a_gaussian_by_hand(device):
+    """A quarter turn about z, twice the size, an offset of each kind."""
+    half = 0.5**0.5
+    frames = (
+        torch.tensor([[1.0, 0, 0, 0], [half, 0, 0, half]], device=device),
+        torch.tensor([1.0, 2.0], device=device),
+        torch.tensor([[0.0, 0, 0], [10, 20, 30]], device=device),
     )
+    face_ids = torch.tensor([1], device=device)
+    offsets = torch.zeros(1, 13, device=device)
+    offsets[0, 0], offsets[0, 4], offsets[0, 8], offsets[0, 9], offsets[0, 12] = 1.0, 0.25, 0.2, 0.5, 1.0
+    local = torch.tensor([[1.0, 0, 0]], device=device), torch.tensor([[1.0, 0, 0, 0]], device=device)
+    more = torch.zeros(1, 3, device=device), torch.zeros(1, device=device)
+    means, quats, scales, opacities, colors = bind_to_faces(frames, face_ids, *local, *more, offsets=offsets)
+    assert means[0].tolist() == pytest.approx([10.0, 24.0, 30.0], abs=1e-5)
+    assert quats[0].tolist() == pytest.approx([half * 0.9, 0.0, 0.0, half * 1.1])
+    assert scales[0].tolist() == pytest.approx([2 * 2.718281828**0.5, 2.0, 2.0])
+    assert float(opacities) == pytest.approx(1 / (1 + 2.718281828**-1))
+    assert colors[0].tolist() == [0.0, 0.25, 0.0]
+    plain = bind_to_faces(frames, face_ids, *local, *more)
+    assert plain[0][0].tolist() == pytest.approx([10.0, 22.0, 30.0], abs=1e-5)
+    assert plain[2][0].tolist() == [2.0, 2.0, 2.0]
+    assert float(plain[3]) == 0.5
+    assert not plain[4].any()
+    assert place_on_faces(frames, face_ids, local[0])[0].tolist() == pytest.approx([10.0, 22.0, 30.0], abs=1e-5)
 
 
-def test_frames_of_shared_and_flipped_faces(device, rng):
-    """Vertices of many faces collect their gradients; a face inside out has the normal that its order says."""
-    verts = torch.randn(30, 3, generator=rng).requires_grad_()
-    faces = torch.stack([torch.randperm(30, generator=rng)[:3] for _ in range(200)])
-    faces = torch.cat([faces, faces[:50, [0, 2, 1]]])
-    assert_matches_twin(
-        lambda v: frames_as_matrices(v, faces.to(v.device)),
-        lambda v: twins.face_frames(v, faces),
-        (verts,),
-        device=device,
-        gradient_tolerance=2e-5,  # slim random triangles
+def test_the_length_of_a_local_quaternion_is_carried_through(device):
+    """A quarter turn about z, twice as large, moved by one along x; the local length of 3 stays."""
+    half = 0.5**0.5
+    frames = (
+        torch.tensor([[half, 0.0, 0.0, half]], device=device),
+        torch.tensor([2.0], device=device),
+        torch.tensor([[1.0, 0.0, 0.0]], device=device),
     )
-
-
-def test_collapsed_faces_stay_finite(device):
-    """Coincident vertices, no edge, no area, needles, far away: a rotation, a positive scale, finite gradients."""
-    e = torch.tensor([1.0, 0.0, 0.0])
-    soup = torch.stack(
-        [
-            torch.zeros(3, 3),
-            torch.stack([0 * e, 0 * e, e]),
-            torch.stack([0 * e, e, e]),
-            torch.stack([0 * e, e, 2 * e]),
-            torch.stack([0 * e, e, torch.tensor([0.5, 1e-7, 0.0])]),
-            torch.stack([0 * e, e, torch.tensor([0.5, 1.1e-5, 0.0])]),
-            torch.stack([0 * e, 1e-20 * e, 1e-20 * e.roll(1)]),
-            torch.stack([0 * e, 1e-12 * e, 1e-12 * e.roll(1)]),
-            torch.stack([1e6 + e, 1e6 + 2 * e, 1e6 + e.roll(1)]),
-            torch.stack([0 * e, 1e15 * e, 1e15 * e.roll(1)]),
-        ]
+    local = (
+        torch.tensor([[1.0, 0.0, 0.0]], device=device),
+        torch.tensor([[3.0, 0.0, 0.0, 0.0]], device=device),
+        torch.tensor([[0.1, 0.2, 0.3]], device=device).log(),
+        torch.zeros(1, device=device),
     )
-    verts = soup.reshape(-1, 3).to(device).requires_grad_()
-    quats, scales, centers = face_frames(verts, torch.arange(30, device=device).reshape(10, 3))
-    (quats.sum() + scales.sum() + centers.sum()).backward()
-    assert torch.allclose(quats.norm(dim=1), torch.ones(10, device=device))
-    assert (scales >= SMALLEST_SCALE).all()
-    for tensor in (scales, centers, verts.grad):
-        assert tensor.isfinite().all()
-    assert torch.equal(scales[:2], torch.full((2,), SMALLEST_SCALE, device=device))
-    assert scales[2:4].tolist() == pytest.approx([0.5, 0.5])
+    means, quats, scales, *_ = bind_to_faces(frames, torch.zeros(1, dtype=torch.long, device=device), *local)
+    assert means[0].tolist() == pytest.approx([1.0, 2.0, 0.0], abs=1e-6)
+    assert quats[0].tolist() == pytest.approx([3 * half, 0.0, 0.0, 3 * half])
+    assert scales[0].tolist() == pytest.approx([0.2, 0.4, 0.6])
 
 
-def test_needles_do_not_throw_their_vertices(device):
-    """The normal's gradient grows as 1 / height; a height that is only rounding passes none."""
-    weights = torch.tensor([1.0, 2.0, 3.0, 4.0], device=device)
-    for height, least, most in ((1e-2, 20.0, 60.0), (1e-4, 2e3, 6e3), (1e-7, 0.1, 10.0)):
-        verts = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, height, 0.0]], device=device).requires_grad_()
-        quats, scales, centers = face_frames(verts, torch.tensor([[0, 1, 2]], device=device))
-        ((quats * weights).sum() + scales.sum() + centers.sum()).backward()
-        assert least < float(verts.grad.abs().max()) < most
+def test_outputs_and_gradients_match_the_float64_twin(device, rng):
+    """Five outputs; eight gradients, those of the frames along the unit sphere only and summed over their Gaussians."""
 
+    def on_sphere(op):
+        return lambda q, *others: op(normalize(q, dim=1), *others)
 
-def test_nan_vertices_spoil_only_their_faces(device):
-    """One vertex of a diverged fit does not reach the faces that do not use it."""
-    verts = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [torch.nan] * 3], device=device)
-    quats, scales, centers = face_frames(verts, torch.tensor([[0, 1, 2], [1, 2, 4], [1, 3, 2]], device=device))
-    assert centers[1].isnan().all()
-    for tensor in (quats, scales, centers):
-        assert tensor[[0, 2]].isfinite().all()
-
-
-def test_gathered_rows_match_the_float64_twin(device, rng):
-    """Rows that are taken often, once and never."""
-    index = torch.cat([torch.zeros(5000, dtype=torch.long), torch.randint(1, 90, (300,), generator=rng)])
-    x = torch.randn(100, 4, generator=rng).requires_grad_()
-    order = gather_matrix(index, 100).to(device)
-    assert_matches_twin(lambda x: gather_rows(x, index, order=order), lambda x: x[index], (x,), device=device)
-    assert torch.equal(gather_rows(x.detach(), index), x.detach()[index])
+    assert_matches_twin(on_sphere(bound), on_sphere(twins.bind_to_faces), scene(rng, 700), device=device)
 
 
 def test_float64_gradients_match_finite_differences(rng):
-    """The adjoint of the float64 build."""
-    verts, faces = triangles(rng, 5)
-    assert_gradcheck(lambda v: face_frames(v, faces), verts)
+    """Also of quaternions that are not of unit length, which both directions take as they are."""
+    q, k, t, face_ids, *local = scene(rng, 6, n_faces=3)
+    assert_gradcheck(lambda q, k, t, *local: bound(q, k, t, face_ids, *local), q, k, t, *local)
+    assert_gradcheck(lambda *local: bind_to_faces((q.double(), k.double(), t.double()), face_ids, *local), *local[:4])
+
+
+def test_frames_without_gradient_get_none(device, rng):
+    """A frozen mesh, as in the appearance stage."""
+    q, k, t, face_ids, *local = (x.detach().to(device) for x in scene(rng, 50))
+    local = [x.requires_grad_() for x in local]
+    sum(out.sum() for out in bound(q, k, t, face_ids, *local)).backward()
+    assert q.grad is None
+    assert all(x.grad.isfinite().all() for x in local)
+
+
+def test_directions_match_rotation_matrices(device, rng):
+    """Carried out of one frame and into the other."""
+    q, _, _, face_ids, means, *_ = (x.detach().to(device) for x in scene(rng, 300))
+    to = normalize(torch.randn(40, 4, generator=rng), dim=1).to(device)
+    position = torch.tensor([0.3, -2.0, 5.0], device=device)
+    found = directions_on_faces(means, position, face_ids, q, to)
+    along = normalize((means - position).double(), dim=1)[:, :, None]
+    turn = twins.quat_matrix(to.double())[face_ids] @ twins.quat_matrix(q.double())[face_ids].mT
+    assert torch.allclose(found.double(), (turn @ along)[:, :, 0], atol=1e-6)
+    assert not directions_on_faces(position[None], position, face_ids[:1], q, to).any()
+
+
+def test_extreme_parameters_stay_where_they_are(device, rng):
+    """NaN and infinity reach their own Gaussian alone; a scale that overflows is infinite, an opacity is 0 or 1."""
+    q, k, t, face_ids, *local = (x.detach().to(device) for x in scene(rng, 6))
+    local[0][0], local[1][1], local[2][2] = torch.nan, torch.inf, 200.0
+    local[3][3], local[3][4] = 200.0, -200.0
+    local = [x.requires_grad_() for x in local]
+    outputs = bound(q, k, t, face_ids, *local)
+    assert outputs[0][0].isnan().all()
+    assert outputs[2][2].isinf().all()
+    assert outputs[3][3:5].tolist() == [1.0, 0.0]
+    sum(out[3:].sum() for out in outputs).backward()
+    for out in outputs:
+        assert out[3:].isfinite().all()
+    for x in local:
+        assert x.grad[3:].isfinite().all()
 
 
 def test_same_bits_for_any_number_of_threads(device, rng):
-    """Corner gathers add up in a fixed order."""
-    faces = torch.randint(50, (2000, 3), generator=rng).to(device)
-    verts = torch.randn(50, 3, generator=rng).requires_grad_()
-    assert_same_bits(lambda v: face_frames(v, faces), (verts,), device=device)
+    """The frames' gradient adds up Gaussians in their order."""
+    assert_same_bits(bound, scene(rng, 3000), device=device)
 
 
-def test_no_faces_have_no_frames():
-    """Empty in, empty out."""
-    quats, scales, _ = face_frames(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.long))
-    assert (quats.shape, scales.shape) == ((0, 4), (0,))
+def test_nothing_is_bound_to_nothing(rng):
+    """No Gaussians."""
+    q, k, t, face_ids, *local = scene(rng, 0)
+    means, *_, colors = bound(q, k, t, face_ids, *local)
+    assert (means.shape, colors.shape) == ((0, 3), (0, 3))
+    assert place_on_faces((q, k, t), face_ids, local[0]).shape == (0, 3)
 
 
 def test_bad_input_is_refused(rng):
-    """Shapes and index ranges."""
-    verts, faces = triangles(rng, 2)
-    with pytest.raises(ValueError, match="index"):
-        face_frames(verts, faces + 4)
-    with pytest.raises(ValueError, match=r"faces \[F, 3\]"):
-        face_frames(verts, faces[:, :2])
-    with pytest.raises(ValueError, match="order has shape"):
-        face_frames(verts, faces, order=gather_matrix(faces, 7))
+    """Shapes and dtypes."""
+    q, k, t, face_ids, *local = scene(rng, 5)
+    with pytest.raises(ValueError, match="local_quats has shape"):
+        bind_to_faces((q, k, t), face_ids, local[0], local[0], *local[2:4])
+    with pytest.raises(ValueError, match="offsets has shape"):
+        bind_to_faces((q, k, t), face_ids, *local[:4], offsets=local[4][:3])
+    with pytest.raises(ValueError, match="face_quats has shape"):
+        bind_to_faces((q[:7], k, t), face_ids, *local[:4])
+    with pytest.raises(ValueError, match="face_centers has shape"):
+        bind_to_faces((q, k, t[:7]), face_ids, *local[:4])
+    with pytest.raises(ValueError, match="log_scales is torch"):
+        bind_to_faces((q, k, t), face_ids, *local[:2], local[2].double(), local[3])

@@ -33,7 +33,7 @@ from mgavatar.errors import DataError
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
 from mgavatar.head.procedural import build_head
-from mgavatar.kernels.face_bound import N_OFFSETS
+from mgavatar.kernels.binding import N_OFFSETS
 
 PAPER = {
     "random_background": False,

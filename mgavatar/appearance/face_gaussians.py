@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.config import AppearanceConfig
-from mgavatar.kernels.binding import face_frames
-from mgavatar.kernels.face_bound import place_on_faces
+from mgavatar.kernels.binding import place_on_faces
+from mgavatar.kernels.face_frames import face_frames
 
 PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
 """Learnable rows of every Gaussian; ``face_ids`` goes along with them."""

@@ -17,7 +17,7 @@ from mgavatar.config import FitConfig
 from mgavatar.gaussians import Gaussians
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Pose
-from mgavatar.kernels.face_bound import bind_to_faces, directions_on_faces
+from mgavatar.kernels.binding import bind_to_faces, directions_on_faces
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.config import OffsetNetConfig, settled
-from mgavatar.kernels.face_bound import N_OFFSETS
+from mgavatar.kernels.binding import N_OFFSETS
 
 N_THETA = 15
 """Rotations of root, neck, jaw and both eyes."""
