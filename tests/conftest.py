@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
+
+if TYPE_CHECKING:
+    from mgavatar.capture.subject import Subject
+    from mgavatar.fit import Views
 
 DATA = Path(os.environ.get("MGAVATAR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 """Real sample data; it is not part of the project, so tests that want it say when it is absent."""
@@ -39,3 +44,20 @@ def real_data() -> Path:
     if not DATA.is_dir():
         pytest.skip("the real sample data is not beside the project (set MGAVATAR_DATA)")
     return DATA
+
+
+# Both import inside: Warp takes two seconds to start, and not every run of the tests needs it.
+@pytest.fixture(scope="session")
+def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
+    """The tiny subject: a stretched ball in three poses, and a fourth that is held out. Only to be read."""
+    from tiny import tiny_subject
+
+    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
+
+
+@pytest.fixture(scope="session")
+def views(subject: Subject) -> Views:
+    """Its training images."""
+    from mgavatar.fit import Views
+
+    return Views.of(subject, 64, with_masks=False)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from ball_head import ball_head
 from scipy.spatial.transform import Rotation
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import WHITE, run, tiny_config, tiny_personal_head
 from torch import Tensor
 
 from mgavatar.appearance.color_net import ColorNet
@@ -22,32 +22,17 @@ from mgavatar.avatar import build_appearance
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import Subject
 from mgavatar.config import AppearanceConfig, FitConfig
-from mgavatar.fit import Views
 from mgavatar.gaussians import draw
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Body
 from mgavatar.losses import image_loss
 
-WHITE = torch.ones(3)
 NO_DENSITY = replace(tiny_config().appearance.density, start=10**6)
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
-
-
-@pytest.fixture(scope="module")
-def views(subject) -> Views:
-    """Its training images."""
-    return Views.of(subject, 64, with_masks=False)
 
 
 def make_head(subject: Subject, config: FitConfig) -> PersonalHead:
     """A head with offsets of both kinds, as after the geometry stage."""
-    torch.manual_seed(0)
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    head = tiny_personal_head(subject, config)
     torch.nn.init.normal_(head.refine.phi_id[-1].weight)
     torch.nn.init.normal_(head.refine.phi_pose[-1].weight)
     return head
@@ -65,15 +50,6 @@ def make_stage(subject: Subject, config: FitConfig | None = None) -> AppearanceS
     return AppearanceStage(make_appearance(subject, config), config, seed=0)
 
 
-def run(stage: AppearanceStage, views: Views, iterations: int) -> dict[str, float]:
-    """Views in turn; the terms of the last step."""
-    for iteration in range(iterations):
-        index = iteration % len(views.images)
-        target = views.images[index].float() / 255.0
-        terms = stage.step(views.cameras[index], views.timesteps[index], target, WHITE)
-    return terms
-
-
 def frame_by_hand(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """R, k and T of a triangle: edge, normal, their cross product; mean of edge and height; centre."""
     edge = (b - a) / np.linalg.norm(b - a)
@@ -84,12 +60,12 @@ def frame_by_hand(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarr
     return np.stack([edge, normal, third], 1), (np.linalg.norm(b - a) + height) / 2, (a + b + c) / 3
 
 
-def test_every_face_starts_with_one_gaussian_at_its_centre(subject):
+def test_every_face_starts_with_one_gaussian_at_its_centre(subject, views):
     """At the start the Gaussians are the faces: their centres, their size, as they lie."""
     appearance = make_appearance(subject)
     config = appearance.config.appearance
     posed = appearance.frozen.at_timestep(0)
-    gaussians, _ = appearance(posed, Views.of(subject, 64, with_masks=False).cameras[0])
+    gaussians, _ = appearance(posed, views.cameras[0])
     faces = appearance.frozen.body.faces.long()
     assert torch.equal(appearance.gaussians.face_ids, torch.arange(len(faces)))
     assert torch.allclose(gaussians.means, posed.verts[faces].mean(1), atol=1e-7)
@@ -439,7 +415,7 @@ def test_without_offset_net(subject, views):
     offset_net = replace(tiny_config().appearance.offset_net, enabled=False)
     stage = make_stage(subject, tiny_config(appearance={"offset_net": offset_net}))
     assert stage.appearance.offset_net is None
-    terms = run(stage, views, 3)
+    terms = run(stage, views, 3)[-1]
     assert terms["offset"] == 0.0
     assert np.isfinite(terms["loss"])
 
@@ -484,7 +460,7 @@ def test_a_stage_goes_on_from_its_state(subject, views, steps):
     state = copy.deepcopy(stage.state_dict())
     other = make_stage(subject)
     other.load_state_dict(state)
-    terms = [run(each, views, 4) for each in (stage, other)]
-    assert terms[0] == terms[1]
+    steps = [run(each, views, 4) for each in (stage, other)]
+    assert steps[0] == steps[1]
     for (name, a), b in zip(stage.appearance.named_parameters(), other.appearance.parameters(), strict=True):
         assert torch.equal(a, b), name

@@ -10,23 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import tiny_config, tiny_personal_head
 
 from mgavatar.avatar import FORMAT, Avatar, CaptureInfo, build_appearance
 from mgavatar.camera import Camera, look_at
 from mgavatar.capture.subject import HeadParams, Subject
 from mgavatar.errors import DataError
-from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.stage import VertexGaussians
-from mgavatar.head.body import Body, Pose, pose_of
+from mgavatar.head.body import Pose, pose_of
 
 Payload = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
 
 
 def disturb(module: torch.nn.Module) -> None:
@@ -38,9 +31,8 @@ def disturb(module: torch.nn.Module) -> None:
 
 def make_avatar(subject: Subject, *, n_gaussians: int | None) -> Avatar:
     """An avatar of which no part is at its start; without Gaussians on faces it is the geometry stage's."""
-    torch.manual_seed(0)
     config = tiny_config()
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    head = tiny_personal_head(subject, config)
     vertex_gaussians = VertexGaussians(head, config)
     disturb(vertex_gaussians)
     bound = None

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import sph_harm_y
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import run, tiny_config, tiny_head, tiny_personal_head
 
 from mgavatar.appearance.spherical_harmonics import sh_basis, sh_colors
 from mgavatar.appearance.stage import AppearanceStage
@@ -20,12 +20,10 @@ from mgavatar.avatar import Avatar, CaptureInfo, build_appearance
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, HeadTuningConfig, OffsetNetConfig, ShConfig, from_dict, read_preset
 from mgavatar.errors import DataError
-from mgavatar.fit import Views
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.stage import GeometryStage, VertexGaussians
 from mgavatar.head.body import Body
 
-WHITE = torch.ones(3)
 BASELINE = {
     "colors": "sh",
     "sh": ShConfig(lr=2e-2),
@@ -34,33 +32,10 @@ BASELINE = {
 }
 
 
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
-
-
-@pytest.fixture(scope="module")
-def views(subject) -> Views:
-    """Its training images."""
-    return Views.of(subject, 64, with_masks=False)
-
-
 def make_stage(subject: Subject, config: FitConfig) -> AppearanceStage:
     """An appearance stage on the mesh as tracked."""
-    torch.manual_seed(0)
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    head = tiny_personal_head(subject, config)
     return AppearanceStage(build_appearance(head, config, seed=0), config, seed=0)
-
-
-def run(stage: Any, views: Views, iterations: int) -> list[float]:
-    """Views in turn; the loss of every step."""
-    losses = []
-    for iteration in range(iterations):
-        view = iteration % len(views.images)
-        target = views.target(view, WHITE, WHITE)
-        losses.append(stage.step(views.cameras[view], views.timesteps[view], target, WHITE)["loss"])
-    return losses
 
 
 def fibonacci(n: int) -> torch.Tensor:
@@ -102,7 +77,7 @@ def test_spherical_harmonics_learn_and_go_through_density_control(subject, views
     config = tiny_config(appearance=BASELINE | {"iterations": 60})
     stage = make_stage(subject, config)
     n_start = len(stage.appearance.gaussians)
-    losses = run(stage, views, 60)
+    losses = [terms["loss"] for terms in run(stage, views, 60)]
     g = stage.appearance.gaussians
     assert len(g) > n_start
     assert g.sh_constant.shape == (len(g), 3)
@@ -215,8 +190,7 @@ def test_joints_are_those_that_the_configuration_names(subject, joints):
 def test_offsets_that_are_switched_off_stay_zero(subject, views, part):
     """The other part learns."""
     config = tiny_config(geometry={f"{part}_offsets": False})
-    torch.manual_seed(0)
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    head = tiny_personal_head(subject, config)
     run(GeometryStage(VertexGaussians(head, config), config), views, 6)
     posed = head.posed(head.pose(0))
     offsets = {"identity": posed.identity_offsets, "pose": posed.pose_offsets}
@@ -228,8 +202,7 @@ def test_offsets_that_are_switched_off_stay_zero(subject, views, part):
 def test_rotations_learn_where_they_may(subject, views, name, learns):
     """``learn_jaw`` and ``learn_eyes``."""
     config = tiny_config(geometry={f"learn_{name}": learns})
-    torch.manual_seed(0)
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+    head = tiny_personal_head(subject, config)
     before = head.poses[name].detach().clone()
     run(GeometryStage(VertexGaussians(head, config), config), views, 6)
     assert torch.equal(head.poses[name], before) != learns

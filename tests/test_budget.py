@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import tiny_config, tiny_head
 
 from mgavatar import cli
 from mgavatar.appearance.density import DensityControl
@@ -212,12 +212,6 @@ def test_a_wrong_budget_is_one_line_before_anything_else(text, tmp_path, monkeyp
     assert said.startswith(f"mgavatar: --budget {text}: ")
     assert said.count("\n") == 1
     assert not (tmp_path / "run").exists()
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses, and a fourth that is held out."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
 
 
 class Timed:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 from checks import threads
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import tiny_config, tiny_head
 
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar
@@ -29,12 +29,6 @@ from mgavatar.geometry.stage import GeometryStage
 from mgavatar.plan import plan
 
 STAGES = {"geometry": GeometryStage, "appearance": AppearanceStage}
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses, and a fourth that is held out."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
 
 
 def fit_into(

@@ -9,48 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_config, tiny_head, tiny_subject
+from tiny import WHITE, run, tiny_config, tiny_personal_head
 
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
-from mgavatar.fit import Views
 from mgavatar.gaussians import SH_C0
-from mgavatar.geometry.head import PersonalHead, PosedHead
+from mgavatar.geometry.head import PosedHead
 from mgavatar.geometry.refine_net import N_POSE, RefineNet
 from mgavatar.geometry.stage import GeometryStage, VertexGaussians, laplacian_loss, offset_loss
-from mgavatar.head.body import Body
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.losses import image_loss
-
-WHITE = torch.ones(3)
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory) -> Subject:
-    """A stretched ball in three poses."""
-    return tiny_subject(tmp_path_factory.mktemp("tiny") / "capture")
-
-
-@pytest.fixture(scope="module")
-def views(subject) -> Views:
-    """Its training images."""
-    return Views.of(subject, 64, with_masks=False)
 
 
 def make_stage(subject: Subject, config: FitConfig) -> GeometryStage:
     """A stage at its start."""
-    torch.manual_seed(0)
-    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
-    return GeometryStage(VertexGaussians(head, config), config)
-
-
-def run(stage: GeometryStage, views: Views, iterations: int) -> dict[str, float]:
-    """Views in turn; the terms of the last step."""
-    for iteration in range(iterations):
-        index = iteration % len(views.images)
-        target = views.images[index].float() / 255.0
-        terms = stage.step(views.cameras[index], views.timesteps[index], target, WHITE)
-    return terms
+    return GeometryStage(VertexGaussians(tiny_personal_head(subject, config), config), config)
 
 
 def random_posed(n: int, *, seed: int = 0) -> PosedHead:
@@ -150,7 +123,7 @@ def test_without_pose_offsets_there_is_no_network(subject, views):
     stage = make_stage(subject, tiny_config(geometry={"pose_offsets": False}))
     assert stage.gaussians.head.refine.phi_pose is None
     assert not any("phi_pose" in name for name, _ in stage.gaussians.named_parameters())
-    terms = run(stage, views, 3)
+    terms = run(stage, views, 3)[-1]
     assert np.isfinite(terms["loss"])
     assert not stage.gaussians.head.posed(stage.gaussians.head.pose(0)).pose_offsets.any()
 
@@ -410,7 +383,7 @@ def test_a_stage_goes_on_from_its_state(subject, views):
     state = copy.deepcopy(stage.state_dict())
     other = make_stage(subject, tiny_config())
     other.load_state_dict(state)
-    terms = [run(each, views, 1) for each in (stage, other)]
-    assert terms[0] == terms[1]
+    steps = [run(each, views, 1) for each in (stage, other)]
+    assert steps[0] == steps[1]
     for a, b in zip(stage.gaussians.parameters(), other.gaussians.parameters(), strict=True):
         assert torch.equal(a, b)

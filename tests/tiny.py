@@ -23,11 +23,16 @@ from mgavatar.config import (
     GeometryConfig,
     OffsetNetConfig,
 )
+from mgavatar.fit import Stage, Views
+from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Body, pose_of
 from mgavatar.head.model import HeadModel
 from mgavatar.kernels.ray_cast import camera_rays, ray_cast
 
 SIZE = (40, 40)
+WHITE = torch.ones(3)
+"""Its background."""
+
 STRETCH = np.array([1.35, 1.2, 1.1], np.float32)
 """What the truth has that the template lacks: no identity coefficient can express it."""
 
@@ -82,6 +87,22 @@ def write_tiny_capture(root: Path, *, n_timesteps: int = 4) -> Path:
 def tiny_subject(root: Path) -> Subject:
     """The same, read back."""
     return read_capture(write_tiny_capture(root))
+
+
+def tiny_personal_head(subject: Subject, config: FitConfig) -> PersonalHead:
+    """Its personal head before a fit, with the same numbers at every call."""
+    torch.manual_seed(0)
+    return PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry)
+
+
+def run(stage: Stage, views: Views, iterations: int) -> list[dict[str, float]]:
+    """Steps of a stage, views in turn; the terms of every step."""
+    steps = []
+    for iteration in range(iterations):
+        view = iteration % len(views.images)
+        target = views.target(view, WHITE, WHITE)
+        steps.append(stage.step(views.cameras[view], views.timesteps[view], target, WHITE))
+    return steps
 
 
 def _picture(
