@@ -70,9 +70,9 @@ class GeometryConfig:
     pose_offsets: bool | Literal["auto"] = True
     """Learn Phi_pose (Eq. 2); ``auto`` does so where neck, jaw or eyes move."""
     learn_jaw: bool | Literal["auto"] = True
-    """Refine the jaw's rotations; ``auto`` does so where the jaw moves."""
+    """Refine the jaw's rotations, also by ``appearance.head_tuning``; ``auto`` does so where the jaw moves."""
     learn_eyes: bool | Literal["auto"] = True
-    """Refine the eyes' rotations; ``auto`` does so where the eyes move."""
+    """Refine the eyes' rotations, also by ``appearance.head_tuning``; ``auto`` does so where the eyes move."""
     offset_unit: float = 0.01
     """What an output of 1 of Phi_id and Phi_pose means [m]."""
     surface_shift: float = 0.0

@@ -265,7 +265,9 @@ RULES: dict[str, Callable[[FitConfig, Sight], tuple[Any, str]]] = {
 
 def _matters(config: FitConfig, key: str) -> bool:
     """Whether the part that a key belongs to takes part in the fit."""
-    if key.startswith("geometry.learn") or key == "geometry.pose_offsets":
+    if key.startswith("geometry.learn"):
+        return config.geometry.enabled or config.appearance.head_tuning.enabled
+    if key == "geometry.pose_offsets":
         return config.geometry.enabled
     if key.startswith("appearance.color_net."):
         return config.appearance.colors == "color_net"

@@ -208,6 +208,16 @@ def test_rotations_learn_where_they_may(subject, views, name, learns):
     assert torch.equal(head.poses[name], before) != learns
 
 
+@pytest.mark.parametrize(("name", "learns"), [("jaw", False), ("eyes", False), ("jaw", True), ("eyes", True)])
+def test_tuning_moves_rotations_only_where_they_may_learn(subject, views, name, learns):
+    """The same two keys hold them in the appearance stage; the neck is tuned either way."""
+    stage = make_stage(subject, tiny_config(geometry={f"learn_{name}": learns}, appearance=BASELINE))
+    before = {key: value.detach().clone() for key, value in stage.poses.items()}
+    run(stage, views, 6)
+    assert torch.equal(stage.poses[name], before[name]) != learns
+    assert not torch.equal(stage.poses["neck"], before["neck"])
+
+
 def flat(config: Any, prefix: str = "") -> dict[str, Any]:
     """Every number of a configuration by its path."""
     values: dict[str, Any] = {}

@@ -294,6 +294,18 @@ def test_what_takes_no_part_is_settled_without_a_word():
     ]
 
 
+def test_head_tuning_is_told_what_it_holds():
+    """Jaw and eyes matter to it even without a geometry stage; offsets by pose do not."""
+    config = from_dict(EVERYTHING | {"appearance": {"head_tuning": {"enabled": True}}})
+    config = dataclasses.replace(config, geometry=dataclasses.replace(config.geometry, enabled=False))
+    _, decisions = plan(config, tiny_head(), made_up())
+    assert [decision.key for decision in decisions] == [
+        "geometry.subdivisions",
+        "geometry.learn_jaw",
+        "geometry.learn_eyes",
+    ]
+
+
 def test_a_head_without_expressions():
     """There is nothing to move it."""
     ball = tiny_head()

@@ -59,7 +59,7 @@ class AppearanceStage:
         self.poses = appearance.frozen.head.poses
         tuning = a.head_tuning
         if tuning.enabled:
-            self.poses.requires_grad_(True)
+            appearance.frozen.head.learn_poses()
             groups += [
                 {"params": [self.poses["expr"]], "lr": tuning.lr_expr},
                 {"params": [self.poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": tuning.lr_pose},

@@ -55,18 +55,23 @@ class PersonalHead(nn.Module):
                 for name, value in tracked.items()
             }
         )
-        for name in ("jaw", "eyes"):
-            self.poses[name].requires_grad_(bool(getattr(config, f"learn_{name}")))
+        self.config = config
+        self.learn_poses()
         self.tracked_offsets: Tensor
         known = _base_offsets(params.static_offset, len(body.v_template)) if config.tracked_offsets else None
         offsets = torch.zeros(0, 3) if known is None else torch.from_numpy(known)
         self.register_buffer("tracked_offsets", offsets.to(device), persistent=False)
-        self.config = config
         self.tracked_joints: Tensor
         with torch.no_grad():
             self.register_buffer("tracked_joints", body.joints(self._tracked_shape(params)), persistent=False)
         template = torch.tensor(body.fine.v_template, device=device)
         self.refine = RefineNet(template, config).to(device)
+
+    def learn_poses(self) -> None:
+        """Let the parameters of all timesteps learn; jaw and eyes where ``learn_jaw`` and ``learn_eyes`` say so."""
+        self.poses.requires_grad_(True)
+        self.poses["jaw"].requires_grad_(bool(self.config.learn_jaw))
+        self.poses["eyes"].requires_grad_(bool(self.config.learn_eyes))
 
     def pose(self, timestep: int) -> Pose:
         """Parameters of a timestep of the capture, as refined so far."""
