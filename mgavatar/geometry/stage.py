@@ -30,7 +30,7 @@ class VertexGaussians(nn.Module):
         self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges))
         self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
         self.start_edges: Tensor
-        self.register_buffer("start_edges", edges)
+        self.register_buffer("start_edges", edges, persistent=False)
 
     def scales(self, posed: PosedHead) -> Tensor:
         """Sigma of every Gaussian [m], shape [V]."""
