@@ -163,17 +163,23 @@ def test_gaussians_are_drawn_behind_the_surface(subject):
 
 
 def test_the_shift_is_in_sigmas_as_the_camera_sees_them(subject, views):
-    """In an image of a quarter of the size a pixel is four times as large, and so is its share of the blur."""
+    """In an image of a quarter of the size a pixel is four times as large, and so is its share of the blur; and the shift
+    falls with the sine of the angle between line of sight and normal."""
     gaussians = make_stage(subject, tiny_config(geometry={"surface_shift": 1.5})).gaussians
     posed = gaussians.head.posed(gaussians.head.pose(0))
     sigmas, camera = gaussians.scales(posed).double(), views.cameras[0]
-    depths = (posed.verts.double() @ torch.tensor(camera.viewmat[:3, :3]).T + torch.tensor(camera.viewmat[:3, 3]))[:, 2]
+    verts, normals = posed.verts.detach().double(), gaussians.head.body.normals(posed.verts).detach().double()
+    depths = (verts @ torch.tensor(camera.viewmat[:3, :3]).T + torch.tensor(camera.viewmat[:3, 3]))[:, 2]
+    sight = torch.nn.functional.normalize(verts - torch.tensor(camera.position), dim=1)
+    sines = torch.sin(torch.acos((sight * normals).sum(1).clamp(-1.0, 1.0)))
+    assert sines.min() < 0.3
+    assert sines.max() > 0.99
     for factor in (1, 4):
         smaller = camera.scaled(camera.width // factor, camera.height // factor)
         pixels = depths / smaller.K[0, 0]
         expected = 1.5 * (sigmas**2 + 0.3 * pixels**2).sqrt()
         moved = gaussians.bound(posed, smaller).means - posed.verts
-        assert torch.allclose(moved.norm(dim=1).double(), expected, rtol=1e-3)
+        assert torch.allclose(moved.norm(dim=1).double(), expected * sines, rtol=1e-3, atol=1e-6)
         assert expected.mean() > 1.05 * 1.5 * sigmas.mean() * factor**0.5
 
 

@@ -41,18 +41,16 @@ class VertexGaussians(nn.Module):
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
     def bound(self, posed: PosedHead, camera: Camera | None = None, *, scales: Tensor | None = None) -> Gaussians:
-        """The Gaussians on a posed head, drawn behind the surface by ``surface_shift`` sigmas.
+        """The Gaussians on a posed head, drawn behind the surface by :func:`behind`.
 
-        Sigmas are those that the camera sees, with the low pass of the rasterizer: what makes the outline of small
-        Gaussians is as much the pixels as themselves. Without a camera they are the Gaussians' own. ``scales`` are
-        those of :meth:`scales`, for a caller that has them already.
+        ``scales`` are those of :meth:`scales`, for a caller that has them already.
         """
         verts = posed.verts
         scales = self.scales(posed) if scales is None else scales
         shift = self.config.geometry.surface_shift
         if shift:
-            apparent = apparent_sigmas(scales.detach(), verts.detach(), camera)
-            verts = verts - shift * apparent[:, None] * self.head.body.normals(verts)
+            normals = self.head.body.normals(verts)
+            verts = verts - shift * behind(scales.detach(), verts.detach(), normals.detach(), camera)[:, None] * normals
         n = len(verts)
         quats = torch.zeros(n, 4, device=verts.device)
         quats[:, 0] = 1.0
@@ -66,13 +64,21 @@ class VertexGaussians(nn.Module):
         return draw(gaussians, camera, background=background, config=self.config.raster)
 
 
-def apparent_sigmas(sigmas: Tensor, means: Tensor, camera: Camera | None) -> Tensor:
-    """Standard deviations as a camera sees them at their distance, low pass included [m], shape [N]."""
+def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera | None) -> Tensor:
+    """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
+
+    One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of small
+    Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal: at the
+    outline opaque Gaussians look larger than the surface that carries them, and seen from the front they do not. Without
+    a camera it is their own sigma.
+    """
     if camera is None:
         return sigmas
     row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
     pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
-    return (sigmas.square() + RasterSettings.low_pass * pixels.square()).sqrt()
+    away = means - torch.tensor(camera.position, dtype=torch.float32, device=means.device)
+    sine = torch.linalg.cross(torch.nn.functional.normalize(away, dim=1), normals).norm(dim=1)
+    return sine * (sigmas.square() + RasterSettings.low_pass * pixels.square()).sqrt()
 
 
 def offset_loss(posed: PosedHead, scales: Tensor) -> Tensor:
