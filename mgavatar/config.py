@@ -76,7 +76,7 @@ class GeometryConfig:
     offset_unit: float = 0.01
     """What an output of 1 of Phi_id and Phi_pose means [m]."""
     surface_shift: float = 0.0
-    """At the outline, Gaussians are drawn this many sigmas, as the camera sees them, behind the surface, elsewhere less,
+    """At the outline Gaussians are drawn this many sigmas, as the camera sees them, behind the surface, elsewhere less,
     with the sine of the angle between line of sight and normal: opaque Gaussians look larger than the surface that
     carries them, and photometry alone pulls the mesh inwards. The paper has none."""
     initial_scale: float = 0.35

@@ -163,8 +163,10 @@ def test_gaussians_are_drawn_behind_the_surface(subject):
 
 
 def test_the_shift_is_in_sigmas_as_the_camera_sees_them(subject, views):
-    """In an image of a quarter of the size a pixel is four times as large, and so is its share of the blur; and the shift
-    falls with the sine of the angle between line of sight and normal."""
+    """In an image of a quarter of the size a pixel is four times as large, and so is its share of the blur.
+
+    The shift falls with the sine of the angle between line of sight and normal.
+    """
     gaussians = make_stage(subject, tiny_config(geometry={"surface_shift": 1.5})).gaussians
     posed = gaussians.head.posed(gaussians.head.pose(0))
     sigmas, camera = gaussians.scales(posed).double(), views.cameras[0]

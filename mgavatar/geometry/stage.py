@@ -67,10 +67,10 @@ class VertexGaussians(nn.Module):
 def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera | None) -> Tensor:
     """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
 
-    One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of small
-    Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal: at the
-    outline opaque Gaussians look larger than the surface that carries them, and seen from the front they do not. Without
-    a camera it is their own sigma.
+    One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of
+    small Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal:
+    at the outline opaque Gaussians look larger than the surface that carries them, seen from the front they do not.
+    Without a camera it is their own sigma.
     """
     if camera is None:
         return sigmas
