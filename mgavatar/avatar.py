@@ -106,10 +106,10 @@ class Avatar:
 
     @torch.no_grad()
     def gaussians(self, pose: Pose, camera: Camera) -> Gaussians:
-        """World-space Gaussians in a pose as a camera sees them; colours depend on the view."""
+        """World-space Gaussians in a pose as a camera sees them."""
         pose = pose.to(self.device)
         if self.appearance is None:
-            return self.vertex_gaussians.bound(self.head.posed(pose))
+            return self.vertex_gaussians.bound(self.head.posed(pose), camera)
         return self.appearance(self.appearance.frozen.posed(pose), camera)[0]
 
     @torch.no_grad()

@@ -11,6 +11,7 @@ import pytest
 import torch
 from tiny import WHITE, run, tiny_config, tiny_personal_head
 
+from mgavatar.avatar import Avatar, CaptureInfo
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.gaussians import SH_C0
@@ -134,7 +135,7 @@ def test_vertex_gaussians_have_reduced_freedom(subject, views):
     run(stage, views, 4)
     gaussians = stage.gaussians
     posed = gaussians.head.posed(gaussians.head.pose(0))
-    bound = gaussians.bound(posed)
+    bound = gaussians.bound(posed, views.cameras[0])
     assert torch.equal(bound.opacities, torch.ones(gaussians.head.body.n_verts))
     assert torch.equal(bound.quats, torch.tensor([1.0, 0, 0, 0]).expand(len(bound.means), 4))
     assert torch.equal(bound.scales, gaussians.scales(posed)[:, None].expand(-1, 3))
@@ -151,15 +152,19 @@ def test_gaussians_start_at_a_share_of_the_edges(subject):
     assert not gaussians.colors.any()
 
 
-def test_gaussians_are_drawn_behind_the_surface(subject):
-    """A shift of 0 draws at the vertices, as in the paper; a shift of 1 one sigma behind them."""
-    at, behind = (make_stage(subject, tiny_config(geometry={"surface_shift": shift})).gaussians for shift in (0.0, 1.0))
-    posed = at.head.posed(at.head.pose(0))
-    assert torch.equal(at.bound(posed).means, posed.verts)
-    moved = behind.bound(posed).means - posed.verts
-    assert torch.allclose(moved.norm(dim=1), behind.log_scales.exp(), rtol=1e-4)
-    inwards = posed.verts.mean(0) - posed.verts
-    assert (moved * inwards).sum(1).min() > 0
+def test_gaussians_are_drawn_behind_the_surface(subject, views):
+    """A shift of 0 draws at the vertices, as in the paper; another one behind them, in the fit as in the avatar."""
+    config = tiny_config(geometry={"surface_shift": 1.0})
+    at, behind = (make_stage(subject, c).gaussians for c in (tiny_config(geometry={"surface_shift": 0.0}), config))
+    pose, camera = at.head.pose(0), views.cameras[0]
+    posed = at.head.posed(pose)
+    assert torch.equal(at.bound(posed, camera).means, posed.verts)
+    drawn = behind.bound(posed, camera)
+    moved = drawn.means - posed.verts
+    assert (moved * (posed.verts.mean(0) - posed.verts)).sum(1).min() >= 0
+    assert moved.norm(dim=1).mean() > 0.5 * behind.scales(posed).mean()
+    avatar = Avatar(behind, None, CaptureInfo.of(subject), config)
+    assert torch.equal(avatar.gaussians(pose, camera).means, drawn.means)
 
 
 def test_the_shift_is_in_sigmas_as_the_camera_sees_them(subject, views):
@@ -186,7 +191,7 @@ def test_the_shift_is_in_sigmas_as_the_camera_sees_them(subject, views):
 
 
 @pytest.mark.parametrize("follow", [False, True])
-def test_scales_that_follow_the_mesh(subject, follow):
+def test_scales_that_follow_the_mesh(subject, views, follow):
     """Where the canonical mesh is stretched to twice its size, its Gaussians grow with it; without the switch not."""
     gaussians = make_stage(subject, tiny_config(geometry={"scales_follow_mesh": follow})).gaussians
     posed = gaussians.head.posed(gaussians.head.pose(0))
@@ -194,16 +199,17 @@ def test_scales_that_follow_the_mesh(subject, follow):
     stretched = replace(posed, identity_offsets=posed.shaped)
     factor = 2.0 if follow else 1.0
     assert torch.allclose(gaussians.scales(stretched), factor * gaussians.log_scales.exp(), rtol=1e-5)
-    assert torch.allclose(gaussians.bound(stretched).scales[:, 0], gaussians.scales(stretched))
+    bound = gaussians.bound(stretched, views.cameras[0])
+    assert torch.allclose(bound.scales[:, 0], gaussians.scales(stretched))
 
 
-def test_the_shift_passes_no_gradient(subject):
-    """Drawn behind or not, the gradient of a vertex is that of its Gaussian, and scales get none from the shift."""
-    gaussians = make_stage(subject, tiny_config()).gaussians
+def test_the_shift_passes_no_gradient(subject, views):
+    """Drawn behind, the gradient of a vertex is that of its Gaussian, and scales get none from the shift."""
+    gaussians = make_stage(subject, tiny_config(geometry={"surface_shift": 1.5})).gaussians
     posed = gaussians.head.posed(gaussians.head.pose(0))
     weights = torch.randn_like(posed.verts)
     verts = posed.verts.detach().requires_grad_()
-    (gaussians.bound(replace(posed, verts=verts)).means * weights).sum().backward()
+    (gaussians.bound(replace(posed, verts=verts), views.cameras[0]).means * weights).sum().backward()
     assert torch.equal(verts.grad, weights)
     assert gaussians.log_scales.grad is None
 

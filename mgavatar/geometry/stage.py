@@ -40,8 +40,8 @@ class VertexGaussians(nn.Module):
         edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
-    def bound(self, posed: PosedHead, camera: Camera | None = None, *, scales: Tensor | None = None) -> Gaussians:
-        """The Gaussians on a posed head, drawn behind the surface by :func:`behind`.
+    def bound(self, posed: PosedHead, camera: Camera, *, scales: Tensor | None = None) -> Gaussians:
+        """The Gaussians on a posed head as a camera sees them: drawn behind the surface by :func:`behind`.
 
         ``scales`` are those of :meth:`scales`, for a caller that has them already.
         """
@@ -64,16 +64,13 @@ class VertexGaussians(nn.Module):
         return draw(gaussians, camera, background=background, config=self.config.raster)
 
 
-def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera | None) -> Tensor:
+def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera) -> Tensor:
     """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
 
     One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of
     small Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal:
     at the outline opaque Gaussians look larger than the surface that carries them, seen from the front they do not.
-    Without a camera it is their own sigma.
     """
-    if camera is None:
-        return sigmas
     row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
     pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
     away = means - torch.tensor(camera.position, dtype=torch.float32, device=means.device)
