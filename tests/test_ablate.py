@@ -243,6 +243,7 @@ sys.exit(130)
 """
     monkeypatch.setattr(ablate, "MGAVATAR", (sys.executable, "-c", child))
     log = tmp_path / "log.txt"
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background start without it
 
     def interrupt() -> None:
         while not log.exists() or "ready" not in log.read_text():
@@ -251,8 +252,11 @@ sys.exit(130)
 
     waiting = threading.Thread(target=interrupt)
     waiting.start()
-    with pytest.raises(KeyboardInterrupt):
-        run_command(["fit", "--out", "x"], log)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_command(["fit", "--out", "x"], log)
+    finally:
+        signal.signal(signal.SIGINT, before)
     waiting.join()
     assert log.read_text().splitlines() == ["$ mgavatar fit --out x", "ready", "saved 1 ['fit', '--out', 'x'] False"]
 
