@@ -345,7 +345,7 @@ def bench(
         views: trade: number of training views to measure on.
     """
     if what == "trade":
-        from mgavatar.bench_trade import bench_trade
+        from mgavatar.benchmarks.trade import bench_trade
 
         if avatar is None or data is None:
             raise DataError("bench trade: give --avatar and --data, the avatar and the capture that it was fitted to")
@@ -354,11 +354,11 @@ def bench(
         print(bench_trade(_avatar_path(avatar), data, out=out, views=views, threads=threads))
         return
     if what == "fit":
-        from mgavatar.bench_fit import bench_fit
+        from mgavatar.benchmarks.fit import bench_fit
 
         print(bench_fit(threads=threads, json_path=json, device=_device(device).type))
         return
-    from mgavatar.bench import bench_kernels
+    from mgavatar.benchmarks.kernels import bench_kernels
 
     chosen = _avatar_path(avatar) if avatar else None
     print(bench_kernels(threads=threads, json_path=json, device=_device(device).type, avatar=chosen))

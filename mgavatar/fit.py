@@ -393,7 +393,10 @@ def _restore(stage: Stage, checkpoint: dict[str, Any], run: Run) -> None:
     try:
         stage.load_state_dict(checkpoint[stage.name])
     except (RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{run.checkpoint}: was made with another capture or head model; give those again") from error
+        raise DataError(
+            f"{run.checkpoint}: does not fit; give the capture and head model that it was made with, "
+            "or leave --resume out for a new folder if an earlier version of mgavatar wrote it"
+        ) from error
 
 
 def _read_checkpoint(run: Run, config: FitConfig, seed: int) -> dict[str, Any]:

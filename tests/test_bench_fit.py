@@ -10,9 +10,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from mgavatar import bench_fit
-from mgavatar.bench_fit_parts import APPEARANCE, GEOMETRY, REST, Profile
-from mgavatar.bench_fit_work import sizes
+from mgavatar.benchmarks import fit as bench_fit
+from mgavatar.benchmarks.fit_parts import APPEARANCE, GEOMETRY, REST, Profile
+from mgavatar.benchmarks.fit_work import sizes
 
 CPU = torch.device("cpu")
 PAUSE = 0.02
@@ -75,7 +75,7 @@ def test_both_stages_in_parts(monkeypatch, tmp_path):
     """A small size, from the command's own function to its table and JSON."""
     quick = replace(next(iter(sizes())), image=(48, 40), gaussians=11_000)
     monkeypatch.setattr(bench_fit, "sizes", lambda: [quick])
-    monkeypatch.setattr("mgavatar.bench_fit_work.WARM_UP", 1)
+    monkeypatch.setattr("mgavatar.benchmarks.fit_work.WARM_UP", 1)
     text = bench_fit.bench_fit(threads=1, json_path=tmp_path / "fit.json", names=("quick",), steps=2)
     geometry, appearance = json.loads((tmp_path / "fit.json").read_text())["rows"]
     for row, parts in ((geometry, GEOMETRY), (appearance, APPEARANCE)):

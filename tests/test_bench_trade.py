@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 from tiny_avatar import tiny_avatar
 
-from mgavatar import bench_trade as trade
-from mgavatar import bench_trade_parts as parts
-from mgavatar import bench_trade_work as work
 from mgavatar import cli
-from mgavatar.bench_trade_chart import table
+from mgavatar.benchmarks import trade
+from mgavatar.benchmarks import trade_parts as parts
+from mgavatar.benchmarks import trade_work as work
+from mgavatar.benchmarks.trade_chart import table
 from mgavatar.config import ACCURACY, RasterConfig
 from mgavatar.errors import DataError
 from mgavatar.gaussians import Gaussians, draw

@@ -9,7 +9,8 @@ import pytest
 import torch
 from tiny_avatar import tiny_avatar
 
-from mgavatar import bench, bench_work
+from mgavatar.benchmarks import kernels as bench
+from mgavatar.benchmarks import kernels_work
 from mgavatar.errors import DataError
 from mgavatar.kernels import bridge
 from mgavatar.render import mean_pose
@@ -25,11 +26,11 @@ def loss_of(step):
 @pytest.mark.parametrize(
     "job",
     [
-        bench_work.raster_job("rasterize", 2000, (64, 48), CPU),
-        bench_work.raster_job("rasterize, opaque", 2000, (64, 48), CPU, opaque=True),
-        bench_work.views_job(1000, (64, 48), CPU),
-        bench_work.lbs_job(CPU, n_verts=2000, n_dirs=9),
-        *bench_work.mesh_jobs(CPU),
+        kernels_work.raster_job("rasterize", 2000, (64, 48), CPU),
+        kernels_work.raster_job("rasterize, opaque", 2000, (64, 48), CPU, opaque=True),
+        kernels_work.views_job(1000, (64, 48), CPU),
+        kernels_work.lbs_job(CPU, n_verts=2000, n_dirs=9),
+        *kernels_work.mesh_jobs(CPU),
     ],
     ids=lambda job: job.name,
 )
@@ -44,13 +45,13 @@ def test_a_fitted_avatar_is_timed_as_it_is_drawn(tmp_path):
     """Its own Gaussians from its own camera; what it is drawn on does not matter."""
     avatar, _ = tiny_avatar(tmp_path)
     avatar.save(tmp_path / "avatar.pt")
-    job = bench_work.avatar_job(tmp_path / "avatar.pt", CPU)
+    job = kernels_work.avatar_job(tmp_path / "avatar.pt", CPU)
     drawn = avatar.render(mean_pose(avatar), avatar.capture.mean_camera(), background=torch.zeros(3))
     assert drawn.alpha.mean() > 0.02
     assert loss_of(job.step) == pytest.approx(float(drawn.image.square().sum()), rel=1e-4)
     assert loss_of(job.plain) == pytest.approx(loss_of(job.step), rel=1e-4)
     assert job.operations > 0
-    names = [job.name for job in islice(bench_work.jobs(CPU, tmp_path / "avatar.pt"), 5)]
+    names = [job.name for job in islice(kernels_work.jobs(CPU, tmp_path / "avatar.pt"), 5)]
     assert names[3:] == ["rasterize, several views", "rasterize, fitted avatar"]
 
 
@@ -58,12 +59,12 @@ def test_a_file_that_is_no_avatar_is_named(tmp_path):
     """The path is in the message."""
     (tmp_path / "avatar.pt").write_bytes(b"no avatar")
     with pytest.raises(DataError, match=r"avatar\.pt"):
-        bench_work.avatar_job(tmp_path / "avatar.pt", CPU)
+        kernels_work.avatar_job(tmp_path / "avatar.pt", CPU)
 
 
 def test_the_hash_grid_and_its_plain_form_take_the_same_steps():
     """Both step an optimizer, so that the loss falls."""
-    job = bench_work.hash_grid_job(CPU, n=500, log2_table_size=10)
+    job = kernels_work.hash_grid_job(CPU, n=500, log2_table_size=10)
     for step in (job.step, job.plain):
         for _ in range(2):
             step()()
@@ -71,9 +72,9 @@ def test_the_hash_grid_and_its_plain_form_take_the_same_steps():
 
 def test_the_head_scene_covers_the_image_alike_for_any_number():
     """Pixels inside ellipses hardly depend on N: sizes shrink as numbers grow."""
-    few, many = (bench_work.raster_job("", n, (512, 512), CPU).operations for n in (5000, 20_000))
+    few, many = (kernels_work.raster_job("", n, (512, 512), CPU).operations for n in (5000, 20_000))
     assert 0.5 < few / many < 2
-    assert few / sum(bench_work.RASTER_OPERATIONS) > 5e6
+    assert few / sum(kernels_work.RASTER_OPERATIONS) > 5e6
 
 
 def test_exponent_of_a_power_law():
@@ -83,7 +84,7 @@ def test_exponent_of_a_power_law():
 
 def test_table_and_json(monkeypatch, tmp_path):
     """One small row goes all the way; threads are put back."""
-    small = bench_work.raster_job("rasterize", 500, (32, 32), CPU)
+    small = kernels_work.raster_job("rasterize", 500, (32, 32), CPU)
     monkeypatch.setattr(bench, "jobs", lambda device, avatar: iter([small]))
     monkeypatch.setattr(bench, "_exponents", lambda device: {"Gaussians": 1.0})
     share = bench._blending_share

@@ -15,10 +15,10 @@ from typing import Any
 import torch
 
 from mgavatar.avatar import Avatar
-from mgavatar.bench import commit_of_checkout, device_name, thread_limit
-from mgavatar.bench_trade_chart import draw_chart, table
-from mgavatar.bench_trade_parts import hash_rows, ssim_rows
-from mgavatar.bench_trade_work import Reference, Row, measure_knob, raster_knobs, scenes_of
+from mgavatar.benchmarks.machine import commit_of_checkout, device_name, thread_limit
+from mgavatar.benchmarks.trade_chart import draw_chart, table
+from mgavatar.benchmarks.trade_parts import hash_rows, ssim_rows
+from mgavatar.benchmarks.trade_work import Reference, Row, measure_knob, raster_knobs, scenes_of
 from mgavatar.capture.vhap import read_capture
 from mgavatar.kernels import bridge
 

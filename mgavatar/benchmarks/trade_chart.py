@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from mgavatar.bench_trade_work import Row
+from mgavatar.benchmarks.trade_work import Row
 
 _SIZE = (1500, 760)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 92, 30, 56, 66

@@ -8,12 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import platform
-import subprocess
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -21,7 +16,16 @@ from typing import Any
 
 import torch
 
-from mgavatar.bench_work import Job, Machine, Step, blending_step, head_scene, jobs, raster_job
+from mgavatar.benchmarks.kernels_work import Job, Step, blending_step, head_scene, jobs, raster_job
+from mgavatar.benchmarks.machine import (
+    Machine,
+    calibrate,
+    commit_of_checkout,
+    device_name,
+    median_of,
+    now,
+    thread_limit,
+)
 from mgavatar.kernels import bridge
 from mgavatar.kernels.rasterize import RasterSettings
 
@@ -50,57 +54,16 @@ class Row:
         return self.forward_ms + self.backward_ms
 
 
-@contextmanager
-def thread_limit(n: int) -> Iterator[None]:
-    """Let kernels and torch use ``n`` CPU threads for a while."""
-    before = bridge.num_threads(), torch.get_num_threads()
-    bridge.set_num_threads(n)
-    torch.set_num_threads(n)
-    try:
-        yield
-    finally:
-        bridge.set_num_threads(before[0])
-        torch.set_num_threads(before[1])
-
-
-def _now(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
-
-
 def _time(step: Step, repeats: int, device: torch.device) -> list[tuple[float, float]]:
     """Seconds of the forward and the backward pass."""
     times = []
     for _ in range(repeats):
-        start = _now(device)
+        start = now(device)
         backward = step()
-        middle = _now(device)
+        middle = now(device)
         backward()
-        times.append((middle - start, _now(device) - middle))
+        times.append((middle - start, now(device) - middle))
     return times
-
-
-def _median_of(function: Callable[[], object], repeats: int, device: torch.device) -> float:
-    function()
-    times = []
-    for _ in range(repeats):
-        start = _now(device)
-        function()
-        times.append(_now(device) - start)
-    return median(times)
-
-
-def calibrate(device: torch.device) -> Machine:
-    """Measure the machine: a matrix product that stays in the caches, and a sum over more than they hold."""
-    n = 768 if device.type == "cpu" else 8192
-    a = torch.rand(n, n, device=device)
-    out = torch.empty_like(a)
-    many = torch.ones(64 * 2**20 if device.type == "cpu" else 2**30, device=device)
-    return Machine(
-        operations=n**3 / _median_of(lambda: torch.mm(a, a, out=out), 15, device),
-        bytes=4.0 * many.numel() / _median_of(many.sum, 7, device),
-    )
 
 
 def _row(job: Job, machine: Machine, threads: int, device: torch.device) -> Row:
@@ -144,7 +107,7 @@ def _exponents(device: torch.device) -> dict[str, float]:
             for _ in range(views):
                 scene.loss(RasterSettings()).backward()
 
-        return _median_of(run, 5, device)
+        return median_of(run, 5, device)
 
     counts, sides, views = (10_000, 20_000, 40_000, 80_000), (128, 256, 512, 1024), (1, 2, 4)
     return {
@@ -152,33 +115,6 @@ def _exponents(device: torch.device) -> dict[str, float]:
         "pixels": _exponent([side**2 for side in sides], [seconds(20_000, side) for side in sides]),
         "views": _exponent(views, [seconds(20_000, 256, n) for n in views]),
     }
-
-
-def device_name(device: torch.device) -> str:
-    """Model of the GPU, or of the processor with its number of cores."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        model = names[0] if names else model
-    return f"{model}, {os.cpu_count()} cores"
-
-
-def commit_of_checkout() -> str | None:
-    """The commit that runs, where the program runs from a checkout with git."""
-    folder = Path(__file__).resolve().parent.parent
-    if not (folder / ".git").exists():
-        return None
-    try:
-        command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
 
 
 def _table(rows: Sequence[Row]) -> str:

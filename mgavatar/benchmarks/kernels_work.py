@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from mgavatar.avatar import Avatar
+from mgavatar.benchmarks.machine import Machine
 from mgavatar.kernels import binding, face_frames, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
@@ -30,14 +31,6 @@ RASTER_OPERATIONS = (26, 62)
 
 SSIM_OPERATIONS = (5 * 22 + 20, 3 * 22 + 20)
 """For each value of the image: a separable window of 11 over five maps forward and three backward."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Machine:
-    """Speed of the machine, measured in the same run: multiply-adds and bytes read a second."""
-
-    operations: float
-    bytes: float
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.avatar import Avatar
-from mgavatar.bench_trade_work import BALANCED, Row, Scene, psnr
+from mgavatar.benchmarks.trade_work import BALANCED, Row, Scene, psnr
 from mgavatar.config import ColorNetConfig
 from mgavatar.kernels.rasterize import Rendering, rasterize
 from mgavatar.kernels.ssim import compare_images
