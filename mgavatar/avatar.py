@@ -27,7 +27,7 @@ from mgavatar.head.load import head_arrays, head_from_arrays
 from mgavatar.head.model import HeadModel
 from mgavatar.kernels.rasterize import Rendering
 
-FORMAT = "mgavatar/1"
+FORMAT = "mgavatar/2"
 
 _NOT_DRAWN = ("exp_avg", "exp_avg_sq", "step")
 """Parts of a state that only an optimizer needs."""

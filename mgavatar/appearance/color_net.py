@@ -39,8 +39,8 @@ class ColorNet(nn.Module):
             directions: Unit view directions, shape [N, 3]; not looked at where ``view_frame`` is ``none``.
 
         Returns:
-            RGB in 0..1, shape [N, 3].
+            RGB, shape [N, 3]: the network's distance from a middle grey, not held inside 0..1.
         """
         features = self.grid((canonical_means - self.low) / self.size)
         weights, biases = linear_layers(self.mlp)
-        return torch.sigmoid(mlp(features, weights, biases, extra=directions if self.sees_directions else None))
+        return 0.5 + mlp(features, weights, biases, extra=directions if self.sees_directions else None)
