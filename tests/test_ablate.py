@@ -68,6 +68,7 @@ class FakeMgavatar:
             (run / "summary.json").write_text(json.dumps(summary))
         else:
             psnr = 31.0 if "baseline" in values["--avatar"] else 30.0
+            psnr += 2.0 * ("seed5" in values["--avatar"])
             lpips = 0.125 if "--lpips-weights" in values else None
             score = {"psnr": psnr, "ssim": 0.9, "lpips": lpips, "lpips_reason": None if lpips else REASON}
             metrics = {"splits": {"val": score, "test": score}, "geometry": GEOMETRY}
@@ -99,7 +100,7 @@ def test_every_cell_is_fitted_and_scored_under_the_same_conditions(
 ) -> None:
     head = tmp_path / "head.npz"
     head.write_text("")
-    assert _run(tmp_path, [captures[0], f"{captures[1]}:{head}"], "--budget", "3m", "--seed", "7") == 0
+    assert _run(tmp_path, [captures[0], f"{captures[1]}:{head}"], "--budget", "3m", "--seeds", "7") == 0
     assert fake.verbs() == ["fit", "evaluate"] * 4
     fits = [command for command in fake.asked if command[0] == "fit"]
     for command in fits:
@@ -109,7 +110,7 @@ def test_every_cell_is_fitted_and_scored_under_the_same_conditions(
         ]
     assert [command[6] for command in fits] == ["quick", "quick,baseline"] * 2
     assert ["--head-model" in command for command in fits] == [False, False, True, True]
-    assert fits[3][4] == str(tmp_path / "out/bob/quick+baseline/run")
+    assert fits[3][4] == str(tmp_path / "out/bob/quick+baseline/seed7/run")
     rows = json.loads((tmp_path / "out/table.json").read_text())["rows"]
     assert [(row["capture"], row["preset"]) for row in rows] == [
         ("ann", "quick"), ("ann", "quick,baseline"), ("bob", "quick"), ("bob", "quick,baseline"),
@@ -144,9 +145,31 @@ def test_the_table_shows_differences_to_the_first_preset(
     assert text.count(f"* LPIPS: {REASON}.") == 1
 
 
+def test_several_seeds_become_one_row_of_means(tmp_path: Path, captures: list[str], fake: FakeMgavatar) -> None:
+    """Each seed is a cell of its own; one that fails is said and left out of the means."""
+    assert _run(tmp_path, captures[:1], "--seeds", "4", "5") == 0
+    fits = [dict(itertools.pairwise(command)) for command in fake.asked if command[0] == "fit"]
+    assert [(fit["--preset"], fit["--seed"]) for fit in fits] == list(
+        itertools.product(["quick", "quick,baseline"], ["4", "5"])
+    )
+    rows = json.loads((tmp_path / "out/table.json").read_text())["rows"]
+    assert [row["val"]["psnr"] for row in rows] == [30.0, 32.0, 31.0, 33.0]
+    text = (tmp_path / "out/table.md").read_text()
+    assert "| ann | quick | 31.00 ± 1.41 |" in text
+    assert "| ann | quick,baseline | 32.00 ± 1.41 (+1.00) |" in text
+    assert "seeds 4, 5" in text
+    fake.breaks = lambda command: "seed6" in " ".join(command)
+    assert _run(tmp_path, captures[:1], "--seeds", "4", "6") == 1
+    text = (tmp_path / "out/table.md").read_text()
+    assert "| ann | quick | 30.00 |" in text
+    assert "* ann, quick, seed 6: fit ended with 1" in text
+    with pytest.raises(DataError, match="one name"):
+        plan_cells(["quick"], captures, Options(tmp_path / "out", seeds=(1, 1)))
+
+
 def test_what_is_done_is_not_done_again(tmp_path: Path, captures: list[str], fake: FakeMgavatar) -> None:
     """Scores stay; an interrupted fit goes on; one that had not saved itself starts again; a finished one is scored."""
-    ann = tmp_path / "out/ann/quick"
+    ann = tmp_path / "out/ann/quick/seed0"
     assert _run(tmp_path, captures) == 0
     fake.asked.clear()
     assert _run(tmp_path, captures) == 0
@@ -183,7 +206,7 @@ def test_a_failed_cell_is_reported_and_the_others_go_on(
     assert "fit ended with 1: mgavatar: bob.png: is damaged" in capsys.readouterr().err
     text = (tmp_path / "out/table.md").read_text()
     assert "| bob | quick | failed |" in text
-    assert "* bob, quick: fit ended with 1: mgavatar: bob.png: is damaged" in text
+    assert "* bob, quick, seed 0: fit ended with 1: mgavatar: bob.png: is damaged" in text
     assert "| bob | quick,baseline |" in text  # its reference is missing, its figures are not
     fake.breaks = lambda command: command[0] == "evaluate"
     assert _run(tmp_path, captures[::-1]) == 1
@@ -197,18 +220,17 @@ def test_a_failed_cell_is_reported_and_the_others_go_on(
 def test_cells_of_other_conditions_are_refused(
     tmp_path: Path, captures: list[str], fake: FakeMgavatar, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Another seed, another budget, or a preset whose file has changed: figures would not be comparable."""
+    """Another budget, or a preset whose file has changed: figures would not be comparable."""
     assert _run(tmp_path, captures) == 0
     fake.asked.clear()
-    for more in (["--seed", "1"], ["--budget", "1m"]):
-        assert _run(tmp_path, captures, *more) == 1
-        assert "was made under other conditions" in capsys.readouterr().err
+    assert _run(tmp_path, captures, "--budget", "1m") == 1
+    assert "was made under other conditions" in capsys.readouterr().err
     assert fake.asked == []
     preset = tmp_path / "mine.toml"
     preset.write_text("[geometry]\niterations = 3\n")
     options = Options(tmp_path / "out")
     (cell,) = plan_cells([str(preset)], captures[:1], options)
-    assert cell.folder == tmp_path / "out/ann/mine"
+    assert cell.folder == tmp_path / "out/ann/mine/seed0"
     assert ablate.complete(cell) is None
     preset.write_text("[geometry]\niterations = 4\n")
     with pytest.raises(DataError, match="was made under other conditions"):
@@ -281,7 +303,7 @@ def test_a_tiny_fit_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert 100 < row["peak_mib"] < 4000
     assert row["val"]["psnr"] > 5
     assert row["geometry"] is None
-    cell = tmp_path / "out/ball/tiny+no-offsetnet"
+    cell = tmp_path / "out/ball/tiny+no-offsetnet/seed0"
     assert "enabled = false" in (cell / "run/config.toml").read_text().partition("[appearance.offset_net]")[2]
     with Image.open(tmp_path / "out/sheet.png") as sheet:
         assert sheet.size[0] == 110 + 2 * (6 + 40)

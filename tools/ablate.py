@@ -2,9 +2,10 @@
 
 python tools/ablate.py --presets quick quick,baseline quick,no-laplacian --captures DIR[:HEAD.npz] ... --out DIR
 
-Each cell, one preset on one capture, is a `mgavatar fit` and a `mgavatar evaluate` in processes of their own. What is
-done is not done again, an interrupted fit goes on, a failed one is reported and tried again the next time. --out gets
-table.md, table.json, sheet.png and a folder for each cell with its run, its log and its metrics.json.
+Each cell, one preset on one capture from one seed, is a `mgavatar fit` and a `mgavatar evaluate` in processes of their
+own. What is done is not done again, an interrupted fit goes on, a failed one is reported and tried again the next time.
+--out gets table.md with the means over the seeds, table.json with every cell, sheet.png of the first seed, and a folder
+for each cell with its run, its log and its metrics.json.
 
 Seconds and memory are the fit's own. A --budget runs from the start of the process, and the first fit after a change of
 the kernels compiles them: fit once before, for equal time.
@@ -21,6 +22,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, stdev
 from typing import Any
 
 from mgavatar.config import read_preset
@@ -37,7 +39,7 @@ class Options:
     """What all cells have in common."""
 
     out: Path
-    seed: int = 0
+    seeds: Sequence[int] = (0,)
     budget: str | None = None
     device: str = "auto"
     lpips_weights: Path | None = None
@@ -45,11 +47,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Cell:
-    """One preset on one capture."""
+    """One preset on one capture from one seed."""
 
     preset: str
     data: Path
     head_model: Path | None
+    seed: int
     options: Options
 
     @property
@@ -62,7 +65,7 @@ class Cell:
 
     @property
     def folder(self) -> Path:
-        return self.options.out / self.capture / self.name
+        return self.options.out / self.capture / self.name / f"seed{self.seed}"
 
     @property
     def run(self) -> Path:
@@ -82,7 +85,7 @@ class Cell:
             "preset": read_preset(self.preset),
             "data": str(self.data.resolve()),
             "head_model": str(self.head_model.resolve()) if self.head_model else None,
-            "seed": self.options.seed,
+            "seed": self.seed,
             "budget": self.options.budget,
             "device": self.options.device,
         }
@@ -90,7 +93,7 @@ class Cell:
     def fit_command(self, *, resume: bool) -> list[str]:
         o = self.options
         command = ["fit", "--data", str(self.data), "--out", str(self.run), "--preset", self.preset]
-        command += ["--seed", str(o.seed), "--device", o.device]
+        command += ["--seed", str(self.seed), "--device", o.device]
         command += ["--head-model", str(self.head_model)] if self.head_model else []
         command += ["--budget", o.budget] if o.budget else []
         return command + (["--resume"] if resume else [])
@@ -111,9 +114,11 @@ def plan_cells(presets: Sequence[str], captures: Sequence[str], options: Options
     for text in captures:
         data, _, head = text.rpartition(":") if text.endswith((".npz", ".pkl")) else (text, "", "")
         places.append((Path(data), Path(head) if head else None))
-    cells = [Cell(preset, data, head, options) for data, head in places for preset in presets]
+    cells = [
+        Cell(preset, data, head, seed, options) for data, head in places for preset in presets for seed in options.seeds
+    ]
     if len({cell.folder for cell in cells}) < len(cells):
-        raise DataError("two captures or two presets have one name; give each a name of its own")
+        raise DataError("two captures, presets or seeds have one name; give each a name of its own")
     for cell in cells:
         if not (cell.data / "transforms_train.json").is_file():
             raise DataError(f"{cell.data}: no transforms_train.json in this folder; give the folder of a capture")
@@ -171,7 +176,7 @@ def _last_line(log: Path) -> str:
 
 def row_of(cell: Cell, failure: str | None) -> Row:
     """Everything about a cell that the table shows; a failed one has only its reason."""
-    row: Row = {"capture": cell.capture, "preset": cell.preset, "failure": failure}
+    row: Row = {"capture": cell.capture, "preset": cell.preset, "seed": cell.seed, "failure": failure}
     if failure is not None:
         return row
     metrics, summary = (json.loads(path.read_text("utf-8")) for path in (cell.metrics, cell.summary))
@@ -199,43 +204,72 @@ _COLUMNS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("mean mm", ("geometry", "mean_mm"), ".2f"),
     ("face+scalp mm", ("geometry", "face_scalp_mm"), ".2f"),
     ("all mm", ("geometry", "all_mm"), ".2f"),
-    ("flipped", ("geometry", "flipped_faces"), ",d"),
-    ("crossings", ("geometry", "crossings"), ",d"),
-    ("new crossings", ("geometry", "new_crossings"), ",d"),
-    ("Gaussians", ("gaussians",), ",d"),
+    ("flipped", ("geometry", "flipped_faces"), ",.0f"),
+    ("crossings", ("geometry", "crossings"), ",.0f"),
+    ("new crossings", ("geometry", "new_crossings"), ",.0f"),
+    ("Gaussians", ("gaussians",), ",.0f"),
     ("s", ("seconds",), ".0f"),
     ("MiB", ("peak_mib",), ".0f"),
 )
 
 
 def table(rows: Sequence[Row], options: Options) -> str:
-    """The rows in Markdown; in brackets, how scores and distances differ from the capture's first preset."""
+    """The means over the seeds in Markdown, with their standard deviations and, in brackets, the differences."""
     budget = f"budget {options.budget}" if options.budget else "no budget"
+    seeds = f"Seed {options.seeds[0]}, {budget}."
+    if len(options.seeds) > 1:
+        listed = ", ".join(map(str, options.seeds))
+        seeds = f"Means over seeds {listed}, {budget}; after ± the standard deviation of a single fit."
     titles = ["capture", "preset", *(title for title, _, _ in _COLUMNS), "iterations"]
-    lines = [f"Seed {options.seed}, {budget}. In brackets: difference to the first preset of the capture.", ""]
+    lines = [f"{seeds} In brackets: difference to the first preset of the capture.", ""]
     lines += ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    firsts: dict[str, list[Row]] = {}
+    for (capture, preset), group in _grouped(rows).items():
+        done = [row for row in group if row["failure"] is None]
+        first = firsts.setdefault(capture, done)
+        cells = [capture, preset]
+        if done:
+            cells += [_shown(done, first, path, form) for _, path, form in _COLUMNS]
+            counts = zip(*(row["iterations"].values() for row in done), strict=True)
+            cells.append(" + ".join(f"{fmean(count):,.0f}" for count in counts))
+        else:
+            cells += ["failed"] + [""] * len(_COLUMNS)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join([*lines, "", *(f"* {note}" for note in _notes(rows)), ""])
+
+
+def _grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+    """The seeds of every preset on every capture."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["capture"], row["preset"]), []).append(row)
+    return groups
+
+
+def _notes(rows: Sequence[Row]) -> list[str]:
+    """What failed, and why there is no LPIPS; each once."""
     notes: dict[str, None] = {}
     for row in rows:
-        first = next(other for other in rows if other["capture"] == row["capture"])
-        cells = [row["capture"], row["preset"]]
         if row["failure"] is not None:
-            cells += ["failed"] + [""] * len(_COLUMNS)
-            notes[f"{row['capture']}, {row['preset']}: {row['failure']}"] = None
-        else:
-            cells += [_shown(row, first, path, form) for _, path, form in _COLUMNS]
-            cells.append(" + ".join(f"{count:,}" for count in row["iterations"].values()))
-            reasons = (row[split]["lpips_reason"] for split in ("val", "test") if row[split])
-            notes |= {f"LPIPS: {reason}.": None for reason in reasons if reason}
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *(f"* {note}" for note in notes), ""])
+            notes[f"{row['capture']}, {row['preset']}, seed {row['seed']}: {row['failure']}"] = None
+            continue
+        reasons = (row[split]["lpips_reason"] for split in ("val", "test") if row[split])
+        notes |= {f"LPIPS: {reason}.": None for reason in reasons if reason}
+    return list(notes)
 
 
-def _shown(row: Row, first: Row, path: tuple[str, ...], form: str) -> str:
-    value, reference = _at(row, path), _at(first, path)
-    if value is None:
+def _shown(rows: Sequence[Row], first: Sequence[Row], path: tuple[str, ...], form: str) -> str:
+    values, references = _values(rows, path), _values(first, path)
+    if not values:
         return "–"
-    differs = row is not first and reference is not None and len(path) > 1
-    return f"{value:{form}}" + (f" ({value - reference:+{form}})" if differs else "")
+    mean, scored = fmean(values), len(path) > 1
+    spread = f" ± {stdev(values):{form}}" if scored and len(values) > 1 else ""
+    differs = rows is not first and references and scored
+    return f"{mean:{form}}{spread}" + (f" ({mean - fmean(references):+{form}})" if differs else "")
+
+
+def _values(rows: Sequence[Row], path: tuple[str, ...]) -> list[float]:
+    return [value for row in rows if (value := _at(row, path)) is not None]
 
 
 def _at(row: Row, path: tuple[str, ...]) -> Any:
@@ -247,17 +281,17 @@ def _at(row: Row, path: tuple[str, ...]) -> Any:
 
 def write_table(rows: Sequence[Row], options: Options) -> None:
     """``table.json`` and ``table.md``."""
-    conditions = {"seed": options.seed, "budget": options.budget, "device": options.device}
+    conditions = {"seeds": list(options.seeds), "budget": options.budget, "device": options.device}
     (options.out / "table.json").write_text(json.dumps({**conditions, "rows": rows}, indent=1) + "\n", "utf-8")
     (options.out / "table.md").write_text(table(rows, options), "utf-8")
 
 
 def write_sheet(cells: Sequence[Cell], options: Options) -> None:
-    """``sheet.png``: what the finished cells look like."""
+    """``sheet.png``: what the finished cells of the first seed look like."""
     from ablate_sheet import contact_sheet
     from PIL import Image
 
-    finished = [cell for cell in cells if cell.metrics.is_file()]
+    finished = [cell for cell in cells if cell.metrics.is_file() and cell.seed == options.seeds[0]]
     captures: dict[Path, list[tuple[str, Path]]] = {}
     for cell in finished:
         captures.setdefault(cell.data, []).append((cell.name, cell.run / "avatar.pt"))
@@ -271,7 +305,7 @@ def ablate(presets: Sequence[str], captures: Sequence[str], options: Options) ->
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for number, cell in enumerate(cells, start=1):
-        print(f"{number}/{len(cells)} {cell.capture}, {cell.preset}", file=sys.stderr, flush=True)
+        print(f"{number}/{len(cells)} {cell.capture}, {cell.preset}, seed {cell.seed}", file=sys.stderr, flush=True)
         failure = complete(cell)
         if failure is not None:
             print(f"  {failure}", file=sys.stderr, flush=True)
@@ -287,7 +321,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--presets", nargs="+", required=True, help="as in fit; the first is compared with")
     parser.add_argument("--captures", nargs="+", required=True, metavar="DIR[:HEAD]", help="and their head models")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="each cell once from each of them")
     parser.add_argument("--budget", help="of each fit, as in fit")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--lpips-weights", type=Path)
