@@ -40,7 +40,10 @@ class GeometryConfig:
     fine_edge: float = 4.0
     """Edges of so few pixels [px] in the images are not worth splitting."""
     lr_refine: float = 1e-3
-    """RefineNet: triplane, Phi_id and Phi_pose."""
+    """RefineNet's networks, Phi_id and Phi_pose."""
+    lr_triplane: float = 1e-3
+    """RefineNet's triplane. The paper has one rate for both; in short fits the triplane, each number of which belongs
+    to a few vertices only, learns better many times faster than the networks, which all vertices share."""
     lr_shape: float = 1e-2
     """Identity coefficients beta."""
     lr_expr: float = 1e-3

@@ -41,6 +41,7 @@ PAPER = {
     "loss.ssim": 0.2,  # lambda_m, Eq. 4 and 11
     "geometry.iterations": 100_000,
     "geometry.lr_refine": 1e-3,  # eta_geo
+    "geometry.lr_triplane": 1e-3,  # RefineNet is triplane and networks
     "geometry.lambda_offset": 10.0,  # lambda_o, Eq. 7
     "geometry.lambda_laplacian": 1e5,  # lambda_l, Eq. 7
     "geometry.hidden": 128,

@@ -307,7 +307,7 @@ def test_ssim_takes_over_in_the_course_of_the_stage(subject, views):
 
 def test_the_loss_falls_and_the_mesh_grows_towards_the_truth(subject, views):
     """Thirty steps bring the images nearer, and the ball takes on some of the stretch that it lacked."""
-    geometry = {"iterations": 30, "lambda_laplacian": 100.0, "lr_refine": 3e-2, "hidden": 32}
+    geometry = {"iterations": 30, "lambda_laplacian": 100.0, "lr_refine": 3e-2, "lr_triplane": 3e-2, "hidden": 32}
     stage = make_stage(subject, tiny_config(geometry=geometry))
     gaussians = stage.gaussians
 
@@ -337,7 +337,7 @@ def test_the_laplacian_keeps_faces_from_turning(subject, views):
     """Without it single faces turn by tens of degrees, the start of the paper's folds; with it none does."""
     turns = {}
     for weight in (0.0, 1e5):
-        geometry = {"iterations": 40, "lambda_laplacian": weight, "lr_refine": 3e-2, "hidden": 32}
+        geometry = {"iterations": 40, "lambda_laplacian": weight, "lr_refine": 3e-2, "lr_triplane": 3e-2, "hidden": 32}
         stage = make_stage(subject, tiny_config(geometry=geometry))
         run(stage, views, 40)
         head = stage.gaussians.head
@@ -384,7 +384,7 @@ def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
     config = tiny_config(geometry={"iterations": 10, "final_lr": 0.25})
     stage = make_stage(subject, config)
     g = config.geometry
-    start = [g.lr_refine, g.lr_shape, g.lr_expr, g.lr_pose, g.lr_translation, g.lr_scale, g.lr_color]
+    start = [g.lr_refine, g.lr_triplane, g.lr_shape, g.lr_expr, g.lr_pose, g.lr_translation, g.lr_scale, g.lr_color]
     assert [group["lr"] for group in stage.optimizer.param_groups] == start
     run(stage, views, 10)
     assert [group["lr"] for group in stage.optimizer.param_groups] == pytest.approx([0.25 * lr for lr in start])

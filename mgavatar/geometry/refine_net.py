@@ -47,6 +47,10 @@ class RefineNet(nn.Module):
             for pair in pairs
         ]
 
+    def networks(self) -> list[nn.Parameter]:
+        """What learns besides the triplane."""
+        return [parameter for name, parameter in self.named_parameters() if name != "planes"]
+
     def encode(self) -> Tensor:
         """Triplane features of all vertices, ``E_tri(mu_0)``, shape [V, 3 channels]."""
         return torch.cat([sparse_apply(s, plane) for s, plane in zip(self._samplers, self.planes, strict=True)], 1)

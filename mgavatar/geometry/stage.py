@@ -105,7 +105,8 @@ class GeometryStage:
         g, head = config.geometry, gaussians.head
         poses = head.poses
         groups = [
-            {"params": list(head.refine.parameters()), "lr": g.lr_refine},
+            {"params": head.refine.networks(), "lr": g.lr_refine},
+            {"params": [head.refine.planes], "lr": g.lr_triplane},
             {"params": [head.betas], "lr": g.lr_shape},
             {"params": [poses["expr"]], "lr": g.lr_expr},
             {"params": [poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": g.lr_pose},
