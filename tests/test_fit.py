@@ -382,7 +382,7 @@ def test_resuming_with_another_capture_is_refused(whole, subject):
         for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
     })  # fmt: skip
     before = whole.avatar.read_bytes()
-    with pytest.raises(DataError, match=r"checkpoint\.pt: .*another capture"):
+    with pytest.raises(DataError, match=r"checkpoint\.pt: does not fit; give the capture"):
         fit_into(whole.folder, replace(subject, params=params), resume=True)
     assert whole.avatar.read_bytes() == before
 
