@@ -48,7 +48,7 @@ def _check_seed(seed: int) -> None:
 def _checked_capture(data: Path, principal_point: Literal["center", "opencv", "opengl"]) -> Subject:
     """Read a capture and decode every image once: what is wrong with it is said before any work."""
     from mgavatar.capture.images import check_images
-    from mgavatar.capture.vhap import read_capture
+    from mgavatar.capture.read import read_capture
 
     subject = read_capture(data, principal_point=principal_point)
     check_images(subject)
@@ -101,8 +101,8 @@ def synth(
         monocular: One camera and a turning head, with two cameras at its sides to score novel views only.
         head_model: Head model to start from, the built-in one by default.
     """
-    from mgavatar.capture.synthetic import make_synthetic_capture
     from mgavatar.progress import Reporter
+    from mgavatar.synthetic.capture import make_synthetic_capture
 
     _check_seed(seed)
 
@@ -128,7 +128,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _head(path: Path | None) -> Any:
     if path is None:
-        from mgavatar.head.procedural import build_head
+        from mgavatar.head.procedural.build import build_head
 
         return build_head()
     from mgavatar.head.load import load_head_model
@@ -162,11 +162,12 @@ def fit(
             and density control are scaled to it. The score of a sample and the report come after.
         config: Every other number.
     """
-    from mgavatar.budget import Budget, parse_budget
+    from mgavatar.fitting.budget import Budget, parse_budget
 
     limit = Budget(parse_budget(budget)) if budget is not None else None
-    from mgavatar.fit import Interrupted, open_run
-    from mgavatar.fit import fit as run_fit
+    from mgavatar.fitting.fit import fit as run_fit
+    from mgavatar.fitting.loop import Interrupted
+    from mgavatar.fitting.run import open_run
 
     _check_seed(seed)
     configs.check(config)
@@ -180,8 +181,8 @@ def fit(
     except Interrupted as stop:
         _say(f"mgavatar: {stop}; {run.avatar} is usable, `--resume` goes on")
         raise SystemExit(130) from None
-    from mgavatar.evaluate import evaluate_sample
-    from mgavatar.report import write_report
+    from mgavatar.reporting.page import write_report
+    from mgavatar.scoring.evaluate import evaluate_sample
 
     metrics = evaluate_sample(avatar, subject, avatar_path=run.avatar)
     report = write_report(run.folder, avatar, subject, metrics, history=run.metrics)
@@ -245,9 +246,9 @@ def render(
         device: Where to compute.
     """
     from mgavatar.avatar import Avatar
-    from mgavatar.driving import read_driving
+    from mgavatar.driving.motion import read_driving
+    from mgavatar.driving.render import render_driving
     from mgavatar.progress import Reporter
-    from mgavatar.render import render_driving
 
     motion = read_driving(driving)
     loaded = Avatar.load(_avatar_path(avatar), device=_device(device))
@@ -293,9 +294,9 @@ def evaluate(
         device: Where to compute.
     """
     from mgavatar.avatar import Avatar
-    from mgavatar.evaluate import evaluate as run_evaluate
-    from mgavatar.evaluate import write_metrics
     from mgavatar.progress import Reporter
+    from mgavatar.scoring.evaluate import evaluate as run_evaluate
+    from mgavatar.scoring.evaluate import write_metrics
 
     path = _avatar_path(avatar)
     loaded = Avatar.load(path, device=_device(device))

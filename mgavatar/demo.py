@@ -11,19 +11,20 @@ import torch
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import check_images
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Split, Subject
-from mgavatar.capture.synthetic import make_synthetic_capture
-from mgavatar.capture.vhap import read_capture
 from mgavatar.config import FitConfig
-from mgavatar.driving import read_driving
+from mgavatar.driving.motion import read_driving
+from mgavatar.driving.render import render_driving
 from mgavatar.errors import DataError
-from mgavatar.evaluate import evaluate, write_metrics
 from mgavatar.files import atomic_write
-from mgavatar.fit import fit, open_run
-from mgavatar.head.procedural import build_head
+from mgavatar.fitting.fit import fit
+from mgavatar.fitting.run import open_run
+from mgavatar.head.procedural.build import build_head
 from mgavatar.progress import Reporter
-from mgavatar.render import render_driving
-from mgavatar.report import write_report
+from mgavatar.reporting.page import write_report
+from mgavatar.scoring.evaluate import evaluate, write_metrics
+from mgavatar.synthetic.capture import make_synthetic_capture
 
 DRIVING_FRAMES = 60
 FPS = 25.0

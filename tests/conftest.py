@@ -11,7 +11,7 @@ import torch
 
 if TYPE_CHECKING:
     from mgavatar.capture.subject import Subject
-    from mgavatar.fit import Views
+    from mgavatar.fitting.views import Views
 
 DATA = Path(os.environ.get("MGAVATAR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 """Real sample data; it is not part of the project, so tests that want it say when it is absent."""
@@ -58,6 +58,6 @@ def subject(tmp_path_factory: pytest.TempPathFactory) -> Subject:
 @pytest.fixture(scope="session")
 def views(subject: Subject) -> Views:
     """Its training images."""
-    from mgavatar.fit import Views
+    from mgavatar.fitting.views import Views
 
     return Views.of(subject, 64, with_masks=False)

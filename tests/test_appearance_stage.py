@@ -15,10 +15,9 @@ from torch import Tensor
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, face_uvs
-from mgavatar.appearance.model import Appearance, PosedMesh
+from mgavatar.appearance.model import Appearance, PosedMesh, build_appearance
 from mgavatar.appearance.offset_net import N_THETA, OffsetNet
 from mgavatar.appearance.stage import AppearanceStage, binding_loss
-from mgavatar.avatar import build_appearance
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import Subject
 from mgavatar.config import AppearanceConfig, FitConfig

@@ -12,12 +12,15 @@ import pytest
 import torch
 from tiny import tiny_config, tiny_personal_head
 
-from mgavatar.avatar import FORMAT, Avatar, CaptureInfo, build_appearance
+from mgavatar.appearance.model import build_appearance
+from mgavatar.avatar import Avatar
+from mgavatar.avatar_file import FORMAT
 from mgavatar.camera import Camera, look_at
-from mgavatar.capture.subject import HeadParams, Subject
+from mgavatar.capture.info import CaptureInfo
+from mgavatar.capture.subject import Subject
 from mgavatar.errors import DataError
-from mgavatar.geometry.stage import VertexGaussians
-from mgavatar.head.body import Pose, pose_of
+from mgavatar.geometry.vertex_gaussians import VertexGaussians
+from mgavatar.head.params import HeadParams, Pose, pose_of
 
 Payload = dict[str, Any]
 
@@ -165,7 +168,7 @@ def test_saving_is_atomic(avatar, saved, tmp_path, monkeypatch):
         file.write(b"half an avatar")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("mgavatar.avatar.torch.save", half)
+    monkeypatch.setattr("mgavatar.avatar_file.torch.save", half)
     with pytest.raises(DataError, match=r"avatar\.pt: cannot be written"):
         avatar.save(path)
     assert path.read_bytes() == saved.read_bytes()

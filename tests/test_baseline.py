@@ -14,14 +14,17 @@ import torch
 from scipy.special import sph_harm_y
 from tiny import run, tiny_config, tiny_head, tiny_personal_head
 
+from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.spherical_harmonics import sh_basis, sh_colors
 from mgavatar.appearance.stage import AppearanceStage
-from mgavatar.avatar import Avatar, CaptureInfo, build_appearance
+from mgavatar.avatar import Avatar
+from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, HeadTuningConfig, OffsetNetConfig, ShConfig, from_dict, read_preset
 from mgavatar.errors import DataError
 from mgavatar.geometry.head import PersonalHead
-from mgavatar.geometry.stage import GeometryStage, VertexGaussians
+from mgavatar.geometry.stage import GeometryStage
+from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
 
 BASELINE = {

@@ -11,9 +11,9 @@ from tiny_avatar import tiny_avatar
 
 from mgavatar.benchmarks import kernels as bench
 from mgavatar.benchmarks import kernels_work
+from mgavatar.driving.retarget import mean_pose
 from mgavatar.errors import DataError
 from mgavatar.kernels import bridge
-from mgavatar.render import mean_pose
 
 CPU = torch.device("cpu")
 

@@ -11,10 +11,10 @@ import trimesh
 from ball_head import ball_head
 from scipy.spatial.transform import Rotation
 
-from mgavatar.capture.subject import HeadParams
-from mgavatar.head.body import FINE_ENOUGH, Body, Pose, fitted, pose_of
+from mgavatar.head.body import FINE_ENOUGH, Body
 from mgavatar.head.model import HeadModel
-from mgavatar.head.procedural import build_head
+from mgavatar.head.params import HeadParams, Pose, fitted, pose_of
+from mgavatar.head.procedural.build import build_head
 from mgavatar.head.subdivide import subdivide
 
 ROTATIONS = ("rotation", "neck", "jaw", "eyes")

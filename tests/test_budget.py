@@ -19,11 +19,13 @@ from mgavatar import cli
 from mgavatar.appearance.density import DensityControl
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar
-from mgavatar.budget import GEOMETRY_SHARE, LEAST, Budget, TooShort, duration, geometry_share, parse_budget
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.errors import DataError
-from mgavatar.fit import Interrupted, Run, fit, open_run
+from mgavatar.fitting.budget import GEOMETRY_SHARE, LEAST, Budget, TooShort, duration, geometry_share, parse_budget
+from mgavatar.fitting.fit import fit
+from mgavatar.fitting.loop import Interrupted
+from mgavatar.fitting.run import Run, open_run
 from mgavatar.geometry.stage import GeometryStage
 
 Cost = Callable[[int, float], float]
@@ -335,7 +337,7 @@ def test_resume_goes_on_with_what_is_left(stage, step, given, subject, tmp_path,
     assert (checkpoint["budget"], checkpoint["used"]) == (20.0, before)
     timed.stop_at = None
     timed.clock.now += 5000.0  # a break costs nothing
-    monkeypatch.setattr("mgavatar.fit.Budget", lambda seconds: Budget(seconds, clock=timed.clock))
+    monkeypatch.setattr("mgavatar.fitting.run.Budget", lambda seconds: Budget(seconds, clock=timed.clock))
     run = fit_into(tmp_path / "run", subject, timed, given, config, resume=True)
     assert timed.clock.now - 6000.0 == pytest.approx(given or 20.0, rel=0.05)
     for name, iterations in (("geometry", 40), ("appearance", 120)):

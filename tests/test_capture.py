@@ -20,8 +20,8 @@ from PIL import Image
 
 from mgavatar.camera import look_at
 from mgavatar.capture.images import check_images, read_images, read_masks
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
-from mgavatar.capture.vhap import read_capture
 from mgavatar.errors import DataError
 
 

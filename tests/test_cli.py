@@ -321,7 +321,7 @@ def test_ctrl_c_before_the_fit_exits_with_130(work, mgavatar, monkeypatch):
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mgavatar.capture.vhap.read_capture", interrupted)
+    monkeypatch.setattr("mgavatar.capture.read.read_capture", interrupted)
     result = mgavatar(*fit_args(work))
     assert result.code == 130
     assert "Traceback" not in result.err

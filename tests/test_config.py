@@ -32,7 +32,7 @@ from mgavatar.config import (
 from mgavatar.errors import DataError
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
-from mgavatar.head.procedural import build_head
+from mgavatar.head.procedural.build import build_head
 from mgavatar.kernels.binding import N_OFFSETS
 
 PAPER = {

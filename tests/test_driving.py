@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from captures import write_capture
 
-from mgavatar.driving import Driving, driving_expression, read_driving
+from mgavatar.driving.motion import Driving, read_driving
+from mgavatar.driving.retarget import driving_expression
 from mgavatar.errors import DataError
 
 RNG = np.random.default_rng(3)

@@ -15,15 +15,16 @@ from torch import Tensor, nn
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Subject
-from mgavatar.capture.vhap import read_capture
 from mgavatar.errors import DataError
-from mgavatar.evaluate import evaluate, evaluate_sample, write_metrics
-from mgavatar.head.body import Pose
+from mgavatar.head.params import Pose
 from mgavatar.kernels.rasterize import Rendering
 from mgavatar.losses import ssim
-from mgavatar.lpips import Lpips, load_lpips, weight_shapes
-from mgavatar.trivial import TrivialPredictors, pose_distances, psnr
+from mgavatar.scoring.baselines import TrivialPredictors, pose_distances
+from mgavatar.scoring.evaluate import evaluate, evaluate_sample, write_metrics
+from mgavatar.scoring.image_metrics import psnr
+from mgavatar.scoring.lpips import Lpips, load_lpips, weight_shapes
 
 GRAY = 0.25
 

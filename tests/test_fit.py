@@ -24,9 +24,12 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, from_dict
 from mgavatar.errors import DataError
-from mgavatar.fit import Interrupted, Run, ViewOrder, Views, fit, open_run
+from mgavatar.fitting.fit import fit
+from mgavatar.fitting.loop import Interrupted
+from mgavatar.fitting.plan import plan
+from mgavatar.fitting.run import Run, open_run
+from mgavatar.fitting.views import ViewOrder, Views
 from mgavatar.geometry.stage import GeometryStage
-from mgavatar.plan import plan
 
 STAGES = {"geometry": GeometryStage, "appearance": AppearanceStage}
 

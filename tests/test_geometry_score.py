@@ -18,8 +18,8 @@ from torch import Tensor
 from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.errors import DataError
-from mgavatar.evaluate import evaluate
-from mgavatar.geometry_score import STEPS, score_geometry
+from mgavatar.scoring.evaluate import evaluate
+from mgavatar.scoring.geometry import STEPS, score_geometry
 
 DISTANCES = {"mean_mm", "median_mm", "p95_mm", "normal_deg"}
 FOLDS = {"flipped_faces", "self_intersections"}

@@ -11,13 +11,15 @@ import pytest
 import torch
 from tiny import WHITE, run, tiny_config, tiny_personal_head
 
-from mgavatar.avatar import Avatar, CaptureInfo
+from mgavatar.avatar import Avatar
+from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.gaussians import SH_C0
 from mgavatar.geometry.head import PosedHead
 from mgavatar.geometry.refine_net import N_POSE, RefineNet
-from mgavatar.geometry.stage import GeometryStage, VertexGaussians, laplacian_loss, offset_loss
+from mgavatar.geometry.stage import GeometryStage, laplacian_loss, offset_loss
+from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.losses import image_loss
 

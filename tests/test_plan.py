@@ -15,10 +15,11 @@ from ball_head import ball_head
 from tiny import tiny_config, tiny_head
 
 from mgavatar.camera import look_at
-from mgavatar.capture.subject import Frame, HeadParams, Subject
+from mgavatar.capture.subject import Frame, Subject
 from mgavatar.config import FitConfig, from_dict, to_toml
+from mgavatar.fitting.plan import Decision, plan
 from mgavatar.head.model import HeadModel
-from mgavatar.plan import Decision, plan
+from mgavatar.head.params import HeadParams
 
 EVERYTHING = {
     "geometry": {"subdivisions": "auto", "pose_offsets": "auto", "learn_jaw": "auto", "learn_eyes": "auto"},

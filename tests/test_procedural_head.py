@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from mgavatar.head.model import HeadModel
-from mgavatar.head.procedural import build_head
+from mgavatar.head.procedural.build import build_head
 
 EYES = {"left_eyeball": (0.031, 0.023, 0.024), "right_eyeball": (-0.031, 0.023, 0.024)}
 EYE_RADIUS = 0.0118

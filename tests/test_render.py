@@ -19,13 +19,15 @@ from tiny_avatar import COLOR, avatar_on, tiny_avatar
 
 from mgavatar.avatar import Avatar
 from mgavatar.camera import look_at
-from mgavatar.capture.vhap import read_capture
-from mgavatar.driving import Driving, read_driving
+from mgavatar.capture.read import read_capture
+from mgavatar.driving.cameras import cameras_of
+from mgavatar.driving.motion import Driving, read_driving
+from mgavatar.driving.render import render_driving
+from mgavatar.driving.retarget import driving_notes, head_points, mean_pose, poses_of
+from mgavatar.driving.writers import EMPTY_DEPTH, to_bytes, write_exr
 from mgavatar.errors import DataError
 from mgavatar.head.load import load_head_model
 from mgavatar.kernels.rasterize import Rendering
-from mgavatar.render import cameras_of, driving_notes, head_points, mean_pose, poses_of, render_driving
-from mgavatar.video import EMPTY_DEPTH, to_bytes, write_exr
 
 N = 5
 

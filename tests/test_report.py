@@ -15,17 +15,18 @@ from PIL import Image
 from tiny import tiny_config, tiny_head
 from tiny_avatar import tiny_avatar
 
-from mgavatar.avatar import Avatar, build_appearance
+from mgavatar.appearance.model import build_appearance
+from mgavatar.avatar import Avatar
 from mgavatar.camera import look_at
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Subject
-from mgavatar.charts import loss_chart, read_history
 from mgavatar.config import FitConfig, GeometryConfig
-from mgavatar.driving import read_driving
-from mgavatar.evaluate import evaluate_sample
-from mgavatar.pictures import ERROR_GAIN, comparison, normal_picture, start_verts, strip
-from mgavatar.report import config_changes, write_report
-from mgavatar.video import to_bytes
+from mgavatar.driving.motion import read_driving
+from mgavatar.driving.writers import to_bytes
+from mgavatar.reporting.charts import loss_chart, read_history
+from mgavatar.reporting.page import config_changes, write_report
+from mgavatar.reporting.pictures import ERROR_GAIN, comparison, normal_picture, start_verts, strip
+from mgavatar.scoring.evaluate import evaluate_sample
 
 
 @pytest.fixture

@@ -12,25 +12,18 @@ import torch
 import warp as wp
 from PIL import Image
 
-from mgavatar.avatar import CaptureInfo
+from mgavatar.capture.info import CaptureInfo
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
-from mgavatar.capture.synthetic import make_synthetic_capture
-from mgavatar.capture.synthetic_image import (
-    Studio,
-    front_camera,
-    frontal_arc,
-    held_out_camera,
-    make_look,
-    side_cameras,
-)
-from mgavatar.capture.synthetic_motion import action_columns, perform
-from mgavatar.capture.synthetic_person import Person, Pose, make_person, subdivision, vertex_normals
-from mgavatar.capture.vhap import read_capture
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
-from mgavatar.head.procedural import build_head
+from mgavatar.head.procedural.build import build_head
 from mgavatar.kernels.portrait import View, portrait
 from mgavatar.kernels.ray_cast import RayMesh
+from mgavatar.synthetic.capture import make_synthetic_capture
+from mgavatar.synthetic.motion import action_columns, perform
+from mgavatar.synthetic.person import Person, Pose, make_person, subdivision, vertex_normals
+from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
 
 SIZE = (48, 40)
 KEYS = {"shape", "expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation"}

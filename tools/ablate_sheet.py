@@ -12,13 +12,13 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Frame, Split, Subject
-from mgavatar.capture.vhap import read_capture
-from mgavatar.evaluate import evaluation_pose, spread
-from mgavatar.geometry_score import Truth
-from mgavatar.pictures import at_most, beside, normal_picture
-from mgavatar.trivial import psnr
-from mgavatar.video import to_bytes
+from mgavatar.driving.writers import to_bytes
+from mgavatar.reporting.pictures import at_most, beside, normal_picture
+from mgavatar.scoring.evaluate import evaluation_pose, spread
+from mgavatar.scoring.image_metrics import psnr
+from mgavatar.scoring.truth import Truth
 
 PANEL = 220
 """Largest height of a picture [px]."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from mgavatar.camera import Camera, look_at
 from mgavatar.config import ImageLossConfig, RasterConfig
 from mgavatar.gaussians import Gaussians, draw
-from mgavatar.geometry.stage import behind
+from mgavatar.geometry.vertex_gaussians import behind
 from mgavatar.losses import image_loss
 
 RADIUS = 0.1

@@ -13,10 +13,10 @@ from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, FaceGauss
 from mgavatar.appearance.offset_net import OffsetNet
 from mgavatar.appearance.spherical_harmonics import sh_colors
 from mgavatar.camera import Camera
-from mgavatar.config import FitConfig
+from mgavatar.config import FitConfig, settled
 from mgavatar.gaussians import Gaussians
 from mgavatar.geometry.head import PersonalHead
-from mgavatar.head.body import Pose
+from mgavatar.head.params import Pose
 from mgavatar.kernels.binding import bind_to_faces, directions_on_faces
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
@@ -168,3 +168,10 @@ class Appearance(nn.Module):
         if offsets is not None:
             colors = colors + more_colors
         return Gaussians(means, quats, scales, opacities, colors), offsets[0] if offsets else None
+
+
+def build_appearance(head: PersonalHead, config: FitConfig, *, seed: int) -> Appearance:
+    """Freeze the head and bind one Gaussian to each of its faces."""
+    offset_net = config.appearance.offset_net
+    frozen = FrozenHead(head, uv_resolution=settled(offset_net.resolution) if offset_net.enabled else None)
+    return Appearance(frozen, config, seed=seed)

@@ -20,7 +20,7 @@ from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.benchmarks.fit_parts import APPEARANCE, GEOMETRY, Parts, Profile
 from mgavatar.benchmarks.fit_work import Bench, Size, refine, sizes
 from mgavatar.benchmarks.machine import commit_of_checkout, device_name, thread_limit
-from mgavatar.fit import Stage
+from mgavatar.fitting.stage import Stage
 from mgavatar.kernels import bridge
 
 

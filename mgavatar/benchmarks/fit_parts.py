@@ -25,7 +25,7 @@ Parts = tuple[tuple[str, str, str], ...]
 """Module or class, attribute, name of the part."""
 
 SHARED: Parts = (
-    ("mgavatar.fit:Views", "target", "data"),
+    ("mgavatar.fitting.views:Views", "target", "data"),
     ("mgavatar.gaussians", "rasterize", "projection, sort, lists"),
     ("mgavatar.kernels.rasterize", "blend", "blending, forward"),
     ("mgavatar.kernels.rasterize", "blend_backward", "blending, backward"),
@@ -38,8 +38,8 @@ GEOMETRY: Parts = (
     ("mgavatar.geometry.refine_net:RefineNet", "encode", "RefineNet: triplane"),
     ("mgavatar.geometry.refine_net:RefineNet", "identity_offsets", "RefineNet: networks"),
     ("mgavatar.geometry.refine_net:RefineNet", "pose_offsets", "RefineNet: networks"),
-    ("mgavatar.geometry.stage:VertexGaussians", "bound", "binding"),
-    ("mgavatar.geometry.stage:VertexGaussians", "scales", "binding"),
+    ("mgavatar.geometry.vertex_gaussians:VertexGaussians", "bound", "binding"),
+    ("mgavatar.geometry.vertex_gaussians:VertexGaussians", "scales", "binding"),
     ("mgavatar.geometry.stage", "image_loss", "image loss"),
     ("mgavatar.geometry.stage", "offset_loss", "offset and Laplacian losses"),
     ("mgavatar.geometry.stage", "laplacian_loss", "offset and Laplacian losses"),

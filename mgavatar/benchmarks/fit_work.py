@@ -8,17 +8,19 @@ from pathlib import Path
 
 import torch
 
+from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.stage import AppearanceStage
-from mgavatar.avatar import build_appearance
-from mgavatar.capture.synthetic import make_synthetic_capture
-from mgavatar.capture.vhap import read_capture
+from mgavatar.capture.read import read_capture
 from mgavatar.config import FitConfig, from_dict, read_preset
-from mgavatar.fit import Stage, Views
+from mgavatar.fitting.plan import plan
+from mgavatar.fitting.stage import Stage
+from mgavatar.fitting.views import Views
 from mgavatar.geometry.head import PersonalHead
-from mgavatar.geometry.stage import GeometryStage, VertexGaussians
+from mgavatar.geometry.stage import GeometryStage
+from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
-from mgavatar.head.procedural import build_head
-from mgavatar.plan import plan
+from mgavatar.head.procedural.build import build_head
+from mgavatar.synthetic.capture import make_synthetic_capture
 
 WARM_UP = 30
 """Iterations of a stage before it is timed: enough for sizes and opacities to leave their start."""

@@ -17,11 +17,11 @@ from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.benchmarks.machine import Machine
+from mgavatar.driving.retarget import mean_pose
 from mgavatar.kernels import binding, face_frames, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
 from mgavatar.kernels.ssim import compare_images
-from mgavatar.render import mean_pose
 
 Step = Callable[[], Callable[[], object]]
 """Runs a forward pass and returns what runs its backward pass."""

@@ -19,7 +19,7 @@ from mgavatar.benchmarks.machine import commit_of_checkout, device_name, thread_
 from mgavatar.benchmarks.trade_chart import draw_chart, table
 from mgavatar.benchmarks.trade_parts import hash_rows, ssim_rows
 from mgavatar.benchmarks.trade_work import Reference, Row, measure_knob, raster_knobs, scenes_of
-from mgavatar.capture.vhap import read_capture
+from mgavatar.capture.read import read_capture
 from mgavatar.kernels import bridge
 
 

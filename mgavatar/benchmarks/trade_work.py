@@ -24,9 +24,9 @@ from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Subject
 from mgavatar.config import ACCURACY
 from mgavatar.errors import DataError
-from mgavatar.evaluate import evaluation_pose
 from mgavatar.kernels import rasterize as raster
 from mgavatar.kernels.rasterize import RasterSettings, Work, rasterize
+from mgavatar.scoring.evaluate import evaluation_pose
 
 GRADIENTS = ("means", "quats", "scales", "opacities", "colors")
 """What a step differentiates, in the rasterizer's order."""

@@ -9,37 +9,11 @@ from typing import Literal
 import numpy as np
 
 from mgavatar.camera import Camera
+from mgavatar.head.params import HeadParams
 
 Split = Literal["train", "val", "test"]
+
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-
-
-@dataclass(frozen=True, eq=False)
-class HeadParams:
-    """FLAME parameters of T timesteps, float32; angles are rotation vectors [rad].
-
-    Attributes:
-        shape: Identity coefficients, shape [S].
-        expr: Expression coefficients, shape [T, E].
-        rotation: Root rotation about the root joint, shape [T, 3].
-        neck_pose: Shape [T, 3].
-        jaw_pose: Shape [T, 3].
-        eyes_pose: Left, then right eye, shape [T, 6].
-        translation: Added after skinning [m], shape [T, 3].
-        static_offset: Vertex offsets of the tracker [m], shape [V, 3], or None.
-    """
-
-    shape: np.ndarray
-    expr: np.ndarray
-    rotation: np.ndarray
-    neck_pose: np.ndarray
-    jaw_pose: np.ndarray
-    eyes_pose: np.ndarray
-    translation: np.ndarray
-    static_offset: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.expr)
 
 
 @dataclass(frozen=True, eq=False)

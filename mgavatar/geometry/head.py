@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mgavatar.capture.subject import HeadParams
 from mgavatar.config import GeometryConfig
 from mgavatar.geometry.refine_net import RefineNet
-from mgavatar.head.body import Body, Pose, fitted
+from mgavatar.head.body import Body
+from mgavatar.head.params import HeadParams, Pose, fitted
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,78 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mgavatar.camera import Camera
 from mgavatar.config import FitConfig, ImageLossConfig
-from mgavatar.gaussians import SH_C0, Gaussians, draw
-from mgavatar.geometry.head import PersonalHead, PosedHead
+from mgavatar.geometry.head import PosedHead
+from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.kernels.laplacian import laplacian
-from mgavatar.kernels.rasterize import RasterSettings, Rendering
 from mgavatar.losses import image_loss
-
-
-class VertexGaussians(nn.Module):
-    """One Gaussian a vertex with reduced freedom: no rotation, one scale, opacity 1, SH degree 0 colour."""
-
-    def __init__(self, head: PersonalHead, config: FitConfig) -> None:
-        super().__init__()
-        self.head = head
-        self.config = config
-        edges = head.body.edge_lengths(head.body.shaped(head.betas.detach()))
-        self.least_edge = 0.2 * float(edges[edges > 0].median())
-        edges = edges.clamp(min=self.least_edge)
-        self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges))
-        self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
-        self.start_edges: Tensor
-        self.register_buffer("start_edges", edges, persistent=False)
-
-    def scales(self, posed: PosedHead) -> Tensor:
-        """Sigma of every Gaussian [m], shape [V]."""
-        scales = self.log_scales.exp()
-        if not self.config.geometry.scales_follow_mesh:
-            return scales
-        edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
-        return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
-
-    def bound(self, posed: PosedHead, camera: Camera, *, scales: Tensor | None = None) -> Gaussians:
-        """The Gaussians on a posed head as a camera sees them: drawn behind the surface by :func:`behind`.
-
-        ``scales`` are those of :meth:`scales`, for a caller that has them already.
-        """
-        verts = posed.verts
-        scales = self.scales(posed) if scales is None else scales
-        shift = self.config.geometry.surface_shift
-        if shift:
-            normals = self.head.body.normals(verts)
-            verts = verts - shift * behind(scales.detach(), verts.detach(), normals.detach(), camera)[:, None] * normals
-        n = len(verts)
-        quats = torch.zeros(n, 4, device=verts.device)
-        quats[:, 0] = 1.0
-        ones = torch.ones(n, device=verts.device)
-        return Gaussians(verts, quats, scales[:, None].expand(n, 3), ones, 0.5 + SH_C0 * self.colors)
-
-    def render(
-        self, posed: PosedHead, camera: Camera, background: Tensor, *, scales: Tensor | None = None
-    ) -> Rendering:
-        gaussians = self.bound(posed, camera, scales=scales)
-        return draw(gaussians, camera, background=background, config=self.config.raster)
-
-
-def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera) -> Tensor:
-    """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
-
-    One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of
-    small Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal:
-    at the outline opaque Gaussians look larger than the surface that carries them, seen from the front they do not.
-    """
-    row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
-    pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
-    away = means - torch.tensor(camera.position, dtype=torch.float32, device=means.device)
-    sine = torch.linalg.cross(torch.nn.functional.normalize(away, dim=1), normals).norm(dim=1)
-    return sine * (sigmas.square() + RasterSettings.low_pass * pixels.square()).sqrt()
 
 
 def offset_loss(posed: PosedHead, scales: Tensor) -> Tensor:

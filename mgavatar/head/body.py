@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Literal
 
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mgavatar.capture.subject import HeadParams
 from mgavatar.head.model import HeadModel
+from mgavatar.head.params import Pose
 from mgavatar.head.subdivide import subdivide
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
@@ -19,53 +19,6 @@ from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 FINE_ENOUGH = 12_000
 """Vertices; the paper's mesh has 20K."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """One timestep of FLAME parameters as tensors; angles are rotation vectors [rad].
-
-    Attributes:
-        expr: Shape [E].
-        rotation: Shape [3].
-        neck: Shape [3].
-        jaw: Shape [3].
-        eyes: Left, then right, shape [6].
-        translation: Metres, shape [3].
-    """
-
-    expr: Tensor
-    rotation: Tensor
-    neck: Tensor
-    jaw: Tensor
-    eyes: Tensor
-    translation: Tensor
-
-    def joint_rotations(self) -> Tensor:
-        """Rotation vectors of root, neck, jaw and both eyes, shape [5, 3]."""
-        return torch.cat([self.rotation, self.neck, self.jaw, self.eyes]).reshape(5, 3)
-
-    def centered(self) -> Pose:
-        """The same face without root rotation and translation."""
-        zero = torch.zeros_like(self.rotation)
-        return Pose(self.expr, zero, self.neck, self.jaw, self.eyes, zero)
-
-    def to(self, device: torch.device) -> Pose:
-        return Pose(*(getattr(self, field.name).to(device) for field in fields(self)))
-
-
-def fitted(values: np.ndarray, n: int) -> np.ndarray:
-    """Coefficients cut or padded with zeros along the last axis to ``n``, float32."""
-    out = np.zeros((*values.shape[:-1], n), np.float32)
-    width = min(n, values.shape[-1])
-    out[..., :width] = values[..., :width]
-    return out
-
-
-def pose_of(params: HeadParams, timestep: int, n_expr: int) -> Pose:
-    """Row ``timestep`` of tracked parameters, with as many expression coefficients as the head has."""
-    rows = (fitted(params.expr, n_expr), params.rotation, params.neck_pose, params.jaw_pose, params.eyes_pose)
-    return Pose(*(torch.from_numpy(row[timestep].copy()) for row in (*rows, params.translation)))
 
 
 class Body:

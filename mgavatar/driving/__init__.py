@@ -1,0 +1,1 @@
+"""Drive an avatar: motion, retargeting, cameras, and writers of images and video."""

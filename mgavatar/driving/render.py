@@ -1,0 +1,83 @@
+"""Drawing a driven avatar into a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from mgavatar.avatar import Avatar
+from mgavatar.camera import Camera
+from mgavatar.driving.cameras import cameras_of
+from mgavatar.driving.motion import Driving
+from mgavatar.driving.retarget import ExpressionMode, HeadMotion, driving_notes, head_points, poses_of
+from mgavatar.driving.writers import Format, frame_writer, kind_of
+from mgavatar.errors import DataError
+from mgavatar.head.params import Pose
+
+
+def render_driving(
+    avatar: Avatar,
+    driving: Driving,
+    *,
+    out: Path,
+    camera: str = "mean",
+    head_motion: HeadMotion = "full",
+    expression: ExpressionMode = "auto",
+    format: Format = "auto",
+    size: tuple[int, int] | None = None,
+    frames: slice | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[str]:
+    """Draw an avatar in every pose of a driving sequence.
+
+    Args:
+        avatar: The avatar.
+        driving: The motion.
+        out: A name ending in ``.mp4`` or ``.gif``, else a folder of PNG or EXR files.
+        camera: ``"mean"``, ``"train:<id>"``, ``"orbit"`` or the path of a ``.json``; see :func:`cameras_of`.
+        head_motion: How much of the driven head's motion to take; see :func:`poses_of`.
+        expression: What to do with the expression columns; see :func:`mgavatar.driving.driving_expression`.
+        format: ``"auto"`` goes by the name of ``out``.
+        size: Width and height [px]; the camera's own if None.
+        frames: Which frames; all if None.
+        progress: Called with the number of frames drawn and their total.
+
+    Returns:
+        Lines for the user: what of the driving sequence was not used.
+
+    Raises:
+        DataError: If ``out`` cannot be written there, the camera is unknown, or no frame is left.
+    """
+    kind = kind_of(out, format)
+    poses = poses_of(avatar, driving, head_motion=head_motion, expression=expression, frames=frames)
+    if not poses:
+        raise DataError(f"{driving.path}: no frames are left of its {len(driving)}; choose other frames")
+    cameras = cameras_of(avatar, camera, n_frames=len(poses), size=size)
+    background = torch.zeros(3) if kind == "exr" else None
+    with frame_writer(out, kind, fps=driving.fps) as add:
+        for index, (pose, view) in enumerate(zip(poses, cameras, strict=True)):
+            add(avatar.render(pose, view, background), view)
+            if progress is not None:
+                progress(index + 1, len(poses))
+    return [*driving_notes(avatar, driving, expression=expression), *_view_notes(avatar, driving, poses, cameras)]
+
+
+def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:
+    """A line if the driven head leaves the picture."""
+    names = ("rotation", "neck", "translation")
+    places = head_points(avatar, *(np.stack([getattr(pose, name).numpy() for pose in poses]) for name in names))
+    outside = sum(not _sees(camera, place) for camera, place in zip(cameras, places, strict=True))
+    if not outside:
+        return []
+    return [
+        f"{driving.path}: the head is outside the picture in {outside} of {len(poses)} frames; "
+        "--head-motion neck keeps it in place"
+    ]
+
+
+def _sees(camera: Camera, place: np.ndarray) -> bool:
+    x, y, z = camera.K @ (camera.viewmat[:3, :3] @ place + camera.viewmat[:3, 3])
+    return bool(z > 0 and 0 <= x < z * camera.width and 0 <= y < z * camera.height)

@@ -1,0 +1,188 @@
+"""From a driving sequence to an avatar's own poses."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from mgavatar.avatar import Avatar
+from mgavatar.driving.motion import Driving
+from mgavatar.head.params import Pose
+
+ExpressionMode = Literal["use", "ignore", "auto"]
+
+
+def driving_expression(
+    driving: Driving, *, n_expr: int, expr_basis: str, expr_names: tuple[str, ...], mode: ExpressionMode
+) -> tuple[np.ndarray, str | None]:
+    """The expression coefficients of a driving sequence for a head: columns mean nothing on a head of another basis.
+
+    ``"use"`` takes the columns as they are, ``"ignore"`` none. ``"auto"`` matches them by name where both sides have
+    names; else takes them if the file's basis is the head's; else, for a file that does not say, if the head is FLAME
+    (the field's convention), or if the file was evidently made for the head: it ends in zeros where the head ends.
+
+    Args:
+        driving: The motion.
+        n_expr: Number of the head's expression directions.
+        expr_basis: The head's basis.
+        expr_names: Names of the head's directions, or an empty tuple.
+        mode: What to do.
+
+    Returns:
+        Coefficients, shape [T, n_expr], float32, and a line that says what was ignored, or None.
+    """
+    nothing = np.zeros((len(driving), n_expr), np.float32)
+    if mode == "ignore" or not driving.expr.any():
+        return nothing, None
+    if mode == "use":
+        return _cut_or_padded(driving, n_expr)
+    if driving.expr_names and expr_names:
+        return _matched_by_name(driving, expr_names)
+    reason = _mismatch(driving, n_expr, expr_basis)
+    if reason is None:
+        return _cut_or_padded(driving, n_expr)
+    return nothing, f"{driving.path}: its expression is ignored, because {reason}; --expression use takes it as it is"
+
+
+def _mismatch(driving: Driving, n_expr: int, expr_basis: str) -> str | None:
+    """Why the file's expression columns cannot be assumed to mean what the head's do, or None."""
+    if driving.expr_basis is not None:
+        same = driving.expr_basis == expr_basis
+        return None if same else f"its basis is {driving.expr_basis} and the head's is {expr_basis}"
+    if expr_basis.startswith("flame"):
+        return None
+    made_for_head = driving.expr.shape[1] >= n_expr and not driving.expr[:, n_expr:].any()
+    if made_for_head and expr_basis != "procedural":
+        return None
+    return f"it does not name its basis, FLAME's is likely, and the head's is {expr_basis}"
+
+
+def _cut_or_padded(driving: Driving, n_expr: int) -> tuple[np.ndarray, str | None]:
+    expr, dropped = driving.expr[:, :n_expr], driving.expr[:, n_expr:]
+    note = None
+    if dropped.any():
+        note = (
+            f"{driving.path}: expression columns {n_expr} to {driving.expr.shape[1] - 1} are ignored, "
+            f"because the head has {n_expr}; they reach {np.abs(dropped).max():.3g}"
+        )
+    return np.pad(expr, ((0, 0), (0, n_expr - expr.shape[1]))), note
+
+
+def _matched_by_name(driving: Driving, expr_names: tuple[str, ...]) -> tuple[np.ndarray, str | None]:
+    expr = np.zeros((len(driving), len(expr_names)), np.float32)
+    column_of = {name: column for column, name in enumerate(expr_names)}
+    unmatched = []
+    for name, values in zip(driving.expr_names, driving.expr.T, strict=True):
+        if name in column_of:
+            expr[:, column_of[name]] = values
+        else:
+            unmatched.append(name)
+    if not unmatched:
+        return expr, None
+    shown = ", ".join(unmatched[:5]) + (", …" if len(unmatched) > 5 else "")
+    return (
+        expr,
+        f"{driving.path}: {len(unmatched)} of {len(driving.expr_names)} expressions are not the head's: {shown}",
+    )
+
+
+HeadMotion = Literal["full", "neck", "none"]
+
+
+def driving_notes(avatar: Avatar, driving: Driving, *, expression: ExpressionMode = "auto") -> list[str]:
+    """Lines for the user: what of a driving sequence an avatar does not use."""
+    note = _expression(avatar, driving, expression)[1]
+    return [*driving.notes, *([note] if note else [])]
+
+
+def poses_of(
+    avatar: Avatar,
+    driving: Driving,
+    *,
+    head_motion: HeadMotion = "full",
+    expression: ExpressionMode = "auto",
+    frames: slice | None = None,
+) -> list[Pose]:
+    """The avatar's poses under a driving sequence.
+
+    Rotations and expressions are taken as they are. ``"full"`` takes root and neck as driven, and moves the whole
+    sequence, which comes from another place, so that the head is on average where it was in training. ``"neck"``
+    keeps the shoulders where they were on average in training and turns the neck by what root and neck turn together,
+    so that the head looks where the driven one does. ``"none"`` keeps root and neck at their means in training.
+
+    Args:
+        avatar: The avatar.
+        driving: The motion.
+        head_motion: As above.
+        expression: What to do with the expression columns.
+        frames: Which frames; all if None.
+
+    Returns:
+        Poses on the CPU. The means are those of all frames, whatever ``frames`` says.
+    """
+    mean = mean_pose(avatar)
+    expr = _expression(avatar, driving, expression)[0]
+    rotation, neck = driving.rotation, driving.neck_pose
+    if head_motion == "full":
+        translation = driving.translation + _shift(avatar, driving, mean)
+    else:
+        translation = np.broadcast_to(mean.translation.numpy(), driving.translation.shape)
+        own_root = Rotation.from_rotvec(mean.rotation.numpy())
+        if head_motion == "neck":
+            turned = Rotation.from_rotvec(rotation) * Rotation.from_rotvec(neck)
+            neck = (own_root.inv() * turned).as_rotvec()
+        else:
+            neck = np.broadcast_to(mean.neck.numpy(), neck.shape)
+        rotation = np.broadcast_to(mean.rotation.numpy(), rotation.shape)
+    columns = (expr, rotation, neck, driving.jaw_pose, driving.eyes_pose, translation)
+    tensors = [
+        torch.tensor(np.ascontiguousarray(column[frames or slice(None)]), dtype=torch.float32) for column in columns
+    ]
+    return [Pose(*row) for row in zip(*tensors, strict=True)]
+
+
+def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """A point inside the head, between neck joint and eyes, in each of T poses [m], shape [T, 3]."""
+    head = avatar.head
+    with torch.no_grad():
+        joints = head.joints(head.canonical()).cpu().numpy().astype(np.float64)
+    root, top = joints[0], joints[1]
+    inside = (top + joints[3] + joints[4]) / 3.0
+    turned = top + Rotation.from_rotvec(neck).apply(inside - top)
+    return root + Rotation.from_rotvec(rotation).apply(turned - root) + translation
+
+
+def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
+    """What moves the driven head's mean place to the avatar's own [m], shape [3]."""
+    own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck, mean.translation)))
+    driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
+    return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)
+
+
+def mean_pose(avatar: Avatar) -> Pose:
+    """Root, neck and translation averaged over the training timesteps; the rest is neutral. On the CPU."""
+    rows = list(avatar.capture.train_timesteps)
+    poses = {name: value.detach().cpu().numpy() for name, value in avatar.head.poses.items()}
+    n_expr = avatar.head_model.n_expr
+    return Pose(
+        expr=torch.zeros(n_expr),
+        rotation=_mean_rotation(poses["rotation"][rows]),
+        neck=_mean_rotation(poses["neck"][rows]),
+        jaw=torch.zeros(3),
+        eyes=torch.zeros(6),
+        translation=torch.from_numpy(poses["translation"][rows].mean(axis=0)),
+    )
+
+
+def _mean_rotation(vectors: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(Rotation.from_rotvec(vectors).mean().as_rotvec()).float()
+
+
+def _expression(avatar: Avatar, driving: Driving, mode: ExpressionMode) -> tuple[np.ndarray, str | None]:
+    model = avatar.head_model
+    return driving_expression(
+        driving, n_expr=model.n_expr, expr_basis=model.expr_basis, expr_names=model.expr_names, mode=mode
+    )

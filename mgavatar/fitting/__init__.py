@@ -1,0 +1,1 @@
+"""Fit an avatar to a capture: plan, budget, views, loop and the files of a run."""

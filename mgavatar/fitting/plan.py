@@ -1,0 +1,303 @@
+"""What of the method a capture needs: every ``auto`` of the configuration settled, each with its reason.
+
+The rules and what they save are in ``docs/plan.md``. A value that the user gave is never touched.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mgavatar.capture.subject import Subject
+from mgavatar.config import FitConfig
+from mgavatar.head.body import FINE_ENOUGH
+from mgavatar.head.model import HeadModel
+from mgavatar.head.params import fitted
+
+STILL = 0.1
+"""A joint that turns by less than this [deg] was not tracked, or was held."""
+
+SMALL_TURN = 2.0
+"""Turns of neck, jaw and eyes up to this [deg] deform the surface by less than images show: a chin 100 mm from its
+joint moves 3.5 mm, and what skinning gets wrong of that is a tenth."""
+
+HALF_PIXEL, HALF_TURN = 0.5, 0.5
+"""Motion up to this [px], or a joint's up to this [deg] (0.9 mm on a chin), is not seen."""
+
+ONE_DIRECTION = 2.0
+"""Directions that differ from their mean by no more than this [deg] are one."""
+
+NARROW_VIEWS = 10.0
+"""Over so small an angle [deg] the shading of skin changes by 1 - cos(10 deg) = 1.5 %, four of 255 steps."""
+
+LEVELS, FINEST = 16, 4096
+"""The paper's grid: 16 levels from 16 to 4096 cells."""
+
+GROWTH = 256.0 ** (1.0 / 15.0)
+"""Each of its levels is 1.45 times finer than the last; here it is as much at most."""
+
+MAP_SIZES = (64, 128, 256)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One settled key.
+
+    Attributes:
+        key: As in the configuration, with dots.
+        value: What ``auto`` became.
+        reason: Why, in a few words with its numbers.
+    """
+
+    key: str
+    value: bool | int | str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.reason} (--{self.key.replace('_', '-')})"
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the training images of a capture can show of the head model.
+
+    Attributes:
+        head: The head model.
+        subject: The capture.
+        max_image_size: As in the configuration of the appearance stage [px].
+    """
+
+    head: HeadModel
+    subject: Subject
+    max_image_size: int
+
+    @cached_property
+    def timesteps(self) -> list[int]:
+        """Rows of the parameters that have training images."""
+        return sorted({frame.timestep for frame in self.subject.frames["train"]})
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """From the head to the camera, in the head's own frame, unit vectors, shape [N, 3]."""
+        p = self.subject.params
+        rows = []
+        for frame, center in zip(self.subject.frames["train"], self._centers, strict=True):
+            turn = _rotation(p.rotation[frame.timestep]) @ _rotation(p.neck_pose[frame.timestep])
+            rows.append(turn.T @ _unit(frame.camera.position - center))
+        return np.stack(rows)
+
+    @cached_property
+    def spread(self) -> float:
+        """Largest angle between a direction and the mean one [deg]; 180 where they cancel."""
+        mean = self.directions.mean(0)
+        if np.linalg.norm(mean) < 1e-6:
+            return 180.0
+        return float(np.degrees(np.arccos(np.clip(self.directions @ _unit(mean), -1.0, 1.0))).max())
+
+    @cached_property
+    def pixel(self) -> float:
+        """Width of a pixel on the head [m], the median of the training images."""
+        widths = []
+        for frame, center in zip(self.subject.frames["train"], self._centers, strict=True):
+            camera = frame.camera
+            shrink = min(1.0, self.max_image_size / max(camera.width, camera.height))
+            depth = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
+            widths.append(max(depth, 1e-6) / (shrink * float(camera.K[0, 0])))
+        return float(np.median(widths))
+
+    @cached_property
+    def edge(self) -> float:
+        """Mean edge of the head model [m]."""
+        verts, faces = self.head.v_template, self.head.faces
+        return float(np.linalg.norm(verts[faces] - verts[np.roll(faces, -1, axis=1)], axis=2).mean())
+
+    @cached_property
+    def extent(self) -> float:
+        """Longest side of the box that ColorNet's grid covers: the head's and a margin of 5 % on either side [m]."""
+        return 1.1 * float(np.ptp(self.head.v_template, axis=0).max())
+
+    @cached_property
+    def head_pixels(self) -> float:
+        """Pixels that the head covers in an image, front and back of its surface halved [px]; the median."""
+        a, b, c = np.moveaxis(self.head.v_template[self.head.faces].astype(np.float64), 1, 0)
+        areas = 0.5 * np.cross(b - a, c - a)
+        return float(np.median(0.5 * np.abs(self.directions @ areas.T).sum(1))) / self.pixel**2
+
+    def turn(self, name: str) -> float:
+        """Largest rotation of a joint away from its mean over the training timesteps [deg]."""
+        values = getattr(self.subject.params, name)[self.timesteps]
+        away = (values - values.mean(0)).reshape(len(values), -1, 3)
+        return float(np.degrees(np.linalg.norm(away, axis=2).max()))
+
+    @cached_property
+    def expression(self) -> float:
+        """Largest motion of a vertex by expressions, away from their mean over the training timesteps [m]."""
+        head = self.head
+        values = fitted(self.subject.params.expr[self.timesteps], head.n_expr)
+        dirs = head.shapedirs[:, :, head.n_shape :].reshape(3 * len(head.v_template), head.n_expr)
+        mean = values.mean(0)
+        return max(float(np.linalg.norm((dirs @ (row - mean)).reshape(-1, 3), axis=1).max()) for row in values)
+
+    @cached_property
+    def _centers(self) -> np.ndarray:
+        """Where the middle of the head is in each training image's world [m], shape [N, 3]."""
+        p, verts = self.subject.params, self.head.v_template
+        root = self.head.J_regressor[0] @ verts
+        out = verts.mean(0) - root
+        steps = [frame.timestep for frame in self.subject.frames["train"]]
+        return np.stack([_rotation(p.rotation[step]) @ out + root + p.translation[step] for step in steps])
+
+
+def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[FitConfig, tuple[Decision, ...]]:
+    """Settle every ``auto`` for a capture.
+
+    Args:
+        config: As the user gave it.
+        head: Head model that the capture was tracked with.
+        subject: The capture; no image is read.
+
+    Returns:
+        The configuration without any ``auto``, and the decisions that change what the fit does.
+    """
+    sight = Sight(head, subject, config.appearance.max_image_size)
+    decisions = []
+    for key, rule in RULES.items():
+        if _value(config, key) != "auto":
+            continue
+        value, reason = rule(config, sight)
+        config = _with(config, key, value)
+        if _matters(config, key):
+            decisions.append(Decision(key, value, reason))
+    if any(decision.key == "appearance.colors" and decision.value == "sh" for decision in decisions):
+        config = _with(config, "appearance.sh.degree", 0)
+    return config, tuple(decisions)
+
+
+def _subdivisions(config: FitConfig, sight: Sight) -> tuple[int, str]:
+    n_verts, pixels = len(sight.head.v_template), sight.edge / sight.pixel
+    if n_verts >= FINE_ENOUGH:
+        return 0, f"no subdivision: the head model has {n_verts} vertices"
+    if pixels <= config.geometry.fine_edge:
+        return 0, f"no subdivision: edges of {pixels:.1f} px are not worth splitting"
+    return 1, f"one subdivision: edges of {pixels:.1f} px are longer than {config.geometry.fine_edge:g}"
+
+
+def _learn_jaw(config: FitConfig, sight: Sight) -> tuple[bool, str]:
+    turn = sight.turn("jaw_pose")
+    return (True, f"jaw refined: it turns by {turn:.1f} deg") if turn > STILL else (False, "jaw held: it never turns")
+
+
+def _learn_eyes(config: FitConfig, sight: Sight) -> tuple[bool, str]:
+    turn = sight.turn("eyes_pose")
+    return (
+        (True, f"eyes refined: they turn by {turn:.1f} deg") if turn > STILL else (False, "eyes held: they are still")
+    )
+
+
+def _pose_offsets(config: FitConfig, sight: Sight) -> tuple[bool, str]:
+    turn = max(sight.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
+    return (
+        turn > SMALL_TURN,
+        f"{'' if turn > SMALL_TURN else 'no '}pose offsets: neck, jaw and eyes turn by {turn:.1f} deg",
+    )
+
+
+def _offset_net(config: FitConfig, sight: Sight) -> tuple[bool, str]:
+    if len(sight.timesteps) == 1:
+        return False, "no OffsetNet: one timestep"
+    pixels = sight.expression / sight.pixel
+    turn = max(sight.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
+    if pixels <= HALF_PIXEL and turn <= HALF_TURN:
+        return False, f"no OffsetNet: expressions move {pixels:.1f} px, neck, jaw and eyes turn by {turn:.1f} deg"
+    return True, f"OffsetNet: expressions move {pixels:.1f} px, neck, jaw and eyes turn by {turn:.1f} deg"
+
+
+def _map_size(config: FitConfig, sight: Sight) -> tuple[int, str]:
+    side = math.sqrt(sight.head_pixels)
+    size = min(MAP_SIZES, key=lambda size: abs(math.log(size / max(side, 1.0))))
+    return size, f"UV maps of {size}: an image has {side:.0f} x {side:.0f} pixels on the head"
+
+
+def _colors(config: FitConfig, sight: Sight) -> tuple[str, str]:
+    if sight.spread <= ONE_DIRECTION:
+        return "sh", f"one colour a Gaussian: views differ by {sight.spread:.1f} deg from one direction"
+    return "color_net", f"ColorNet: views differ by up to {sight.spread:.1f} deg from their mean"
+
+
+def _view_frame(config: FitConfig, sight: Sight) -> tuple[str, str]:
+    if sight.spread <= NARROW_VIEWS:
+        return "none", f"colours without view direction: views differ by {sight.spread:.1f} deg at most"
+    return "canonical", f"colours by view direction in the head's frame: views differ by up to {sight.spread:.0f} deg"
+
+
+def _max_resolution(config: FitConfig, sight: Sight) -> tuple[int, str]:
+    base = config.appearance.color_net.base_resolution
+    cells = max(base, min(FINEST, math.ceil(sight.extent / sight.pixel)))
+    return cells, f"hash grid up to {cells} cells: {_mm(sight.extent / cells)}, a pixel {_mm(sight.pixel)}"
+
+
+def _levels(config: FitConfig, sight: Sight) -> tuple[int, str]:
+    grid = config.appearance.color_net
+    steps = math.log(float(grid.max_resolution) / grid.base_resolution) / math.log(GROWTH)
+    levels = min(LEVELS, 1 + math.ceil(steps - 1e-3))
+    return levels, f"{levels} hash levels: {grid.base_resolution} to {grid.max_resolution} cells"
+
+
+RULES: dict[str, Callable[[FitConfig, Sight], tuple[Any, str]]] = {
+    "geometry.subdivisions": _subdivisions,
+    "geometry.learn_jaw": _learn_jaw,
+    "geometry.learn_eyes": _learn_eyes,
+    "geometry.pose_offsets": _pose_offsets,
+    "appearance.colors": _colors,
+    "appearance.color_net.view_frame": _view_frame,
+    "appearance.color_net.max_resolution": _max_resolution,
+    "appearance.color_net.levels": _levels,
+    "appearance.offset_net.enabled": _offset_net,
+    "appearance.offset_net.resolution": _map_size,
+}
+"""Every key that may be ``auto``, in the order in which they are settled."""
+
+
+def _matters(config: FitConfig, key: str) -> bool:
+    """Whether the part that a key belongs to takes part in the fit."""
+    if key.startswith("geometry.learn"):
+        return config.geometry.enabled or config.appearance.head_tuning.enabled
+    if key == "geometry.pose_offsets":
+        return config.geometry.enabled
+    if key.startswith("appearance.color_net."):
+        return config.appearance.colors == "color_net"
+    return key != "appearance.offset_net.resolution" or config.appearance.offset_net.enabled is True
+
+
+def _mm(length: float) -> str:
+    return f"{1e3 * length:.2f} mm"
+
+
+def _value(config: Any, key: str) -> Any:
+    for name in key.split("."):
+        config = getattr(config, name)
+    return config
+
+
+def _with(config: Any, key: str, value: Any) -> Any:
+    """A copy of nested dataclasses with another value at a dotted key."""
+    name, _, rest = key.partition(".")
+    return dataclasses.replace(config, **{name: _with(getattr(config, name), rest, value) if rest else value})
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a rotation vector [rad] (Rodrigues), shape [3, 3]."""
+    angle = float(np.linalg.norm(vector))
+    x, y, z = np.asarray(vector, np.float64) / max(angle, 1e-12)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross

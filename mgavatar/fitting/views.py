@@ -1,0 +1,65 @@
+"""Training images in memory, and the order in which a fit sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from mgavatar.camera import Camera
+from mgavatar.capture.images import read_images, read_masks
+from mgavatar.capture.subject import Subject
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Training images in memory, as bytes.
+
+    Attributes:
+        images: Shape [N, 3, H, W], uint8, on the CPU.
+        masks: Coverage, shape [N, H, W], uint8, or None where a view has none.
+        cameras: N cameras at the size of ``images``.
+        timesteps: N rows of the capture's parameters.
+    """
+
+    images: Tensor
+    masks: Tensor | None
+    cameras: list[Camera]
+    timesteps: list[int]
+
+    @staticmethod
+    def of(subject: Subject, max_size: int, *, with_masks: bool) -> Views:
+        """Decode the training split, reduced until its longer side has at most ``max_size`` pixels."""
+        frames = subject.frames["train"]
+        first = frames[0].camera
+        scale = min(1.0, max_size / max(first.width, first.height))
+        size = (max(1, round(first.width * scale)), max(1, round(first.height * scale)))
+        cameras = [frame.camera.scaled(*size) for frame in frames]
+        masked = with_masks and all(frame.mask_path is not None for frame in frames)
+        masks = read_masks(frames, size=size) if masked else None
+        return Views(read_images(frames, size=size), masks, cameras, [frame.timestep for frame in frames])
+
+    def target(self, view: int, background: Tensor, new_background: Tensor) -> Tensor:
+        """A view in 0..1, shape [3, H, W], moved from one background colour to another."""
+        image = self.images[view].to(background.device).float() / 255.0
+        if self.masks is None:
+            return image
+        clear = 1.0 - self.masks[view].to(background.device).float() / 255.0
+        return image + clear * (new_background - background)[:, None, None]
+
+
+class ViewOrder:
+    """Endless shuffled passes over the views."""
+
+    def __init__(self, n_views: int, seed: int) -> None:
+        self.n_views = n_views
+        self.rng = np.random.default_rng(seed)
+        self.left: list[int] = []
+
+    def __iter__(self) -> Iterator[int]:
+        while True:
+            if not self.left:
+                self.left = self.rng.permutation(self.n_views).tolist()
+            yield self.left.pop()

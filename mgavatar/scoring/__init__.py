@@ -1,0 +1,1 @@
+"""Scores of an avatar: images, geometry, and naive baselines."""

@@ -1,0 +1,97 @@
+"""Predictors that know nothing of heads: what a score must beat before it means anything."""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from mgavatar.capture.images import read_images
+from mgavatar.capture.subject import Frame, Subject
+from mgavatar.head.params import HeadParams
+from mgavatar.scoring.image_metrics import psnr
+
+_AT_ONCE = 16
+
+_ARM = 0.1
+"""How far from the head's centre rotations are felt [m]: a radian weighs as much as 0.1 m."""
+
+_EXPRESSION = 0.002
+"""What one unit of expression typically moves [m]."""
+
+
+class TrivialPredictors:
+    """White, the mean training image, and the nearest training image, each scored as an avatar is.
+
+    The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distances`. A camera that
+    training lacks is replaced by the nearest one.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self._train = subject.frames["train"]
+        self._camera_positions = {frame.camera_id: frame.camera.position for frame in self._train}
+        self._distances = lru_cache(maxsize=64)(partial(pose_distances, subject.params))
+        self._read = lru_cache(maxsize=16)(_read_float)
+        self._mean = lru_cache(maxsize=4)(self._mean_image)
+
+    def scores(self, frame: Frame, target: Tensor) -> dict[str, float | None]:
+        """PSNR of each predictor for one image [dB]; None where there is nothing to predict with."""
+        mean = self._mean(target.shape[2], target.shape[1])
+        nearest = self.nearest_frame(frame)
+        return {
+            "white": psnr(torch.ones_like(target), target),
+            "mean_image": None if mean is None else psnr(mean, target),
+            "nearest_frame": None if nearest is None else psnr(self._read(nearest), target),
+        }
+
+    def nearest_frame(self, frame: Frame) -> Frame | None:
+        """The training frame that looks most like ``frame`` by camera and pose, or None for a training frame."""
+        if frame in self._train:
+            return None
+        size = (frame.camera.width, frame.camera.height)
+        same_size = [other for other in self._train if (other.camera.width, other.camera.height) == size]
+        if not same_size:
+            return None
+        camera_id = self._nearest_camera(frame, {other.camera_id for other in same_size})
+        candidates = [other for other in same_size if other.camera_id == camera_id]
+        distances = self._distances(frame.timestep)
+        return min(candidates, key=lambda other: float(distances[other.timestep]))
+
+    def _nearest_camera(self, frame: Frame, camera_ids: set[int]) -> int:
+        if frame.camera_id in camera_ids:
+            return frame.camera_id
+        position = frame.camera.position
+        return min(
+            sorted(camera_ids), key=lambda index: float(np.linalg.norm(self._camera_positions[index] - position))
+        )
+
+    def _mean_image(self, width: int, height: int) -> Tensor | None:
+        """Mean of the training images of this size, [3, H, W], or None if there is none."""
+        frames = [frame for frame in self._train if (frame.camera.width, frame.camera.height) == (width, height)]
+        if not frames:
+            return None
+        total = torch.zeros(3, height, width, dtype=torch.int64)
+        for first in range(0, len(frames), _AT_ONCE):
+            total += read_images(frames[first : first + _AT_ONCE]).sum(dim=0)
+        return (total.double() / (255.0 * len(frames))).float()
+
+
+def _read_float(frame: Frame) -> Tensor:
+    return read_images([frame], threads=1)[0].float() / 255.0
+
+
+def pose_distances(params: HeadParams, timestep: int) -> np.ndarray:
+    """How far the head of a timestep is from those of all timesteps [m], shape [T].
+
+    The sum of what root and neck together, jaw, translation and expression move.
+    """
+    head = Rotation.from_rotvec(params.rotation) * Rotation.from_rotvec(params.neck_pose)
+    turn = (head[timestep].inv() * head).magnitude()
+    jaw, moved, expr = (
+        np.linalg.norm(values - values[timestep], axis=1)
+        for values in (params.jaw_pose, params.translation, params.expr)
+    )
+    return _ARM * (turn + jaw) + moved + _EXPRESSION * expr

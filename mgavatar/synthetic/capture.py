@@ -1,0 +1,276 @@
+"""Synthetic captures: ray-traced pictures of a person who is not in the head model, with exact geometry beside them.
+
+They take the place of licensed data in trials, tests and the demo. The pictures come from a ray tracer and the motion
+from a float64 skinning of its own: no part of the method that is fitted to them made them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mgavatar.camera import Camera
+from mgavatar.capture.subject import SPLITS, Split
+from mgavatar.errors import DataError
+from mgavatar.head.model import HeadModel
+from mgavatar.synthetic.motion import perform, tracked
+from mgavatar.synthetic.person import Person, Pose, make_person
+from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
+
+_TURN = math.radians(20)
+_N_SHAPE, _N_EXPR = 300, 100
+"""Sizes of VHAP's ``shape`` and ``expr``; more expression directions make ``expr`` longer."""
+_SIDE_TIMESTEPS = 6
+"""The side cameras of a monocular capture see so many of the training timesteps."""
+
+
+def make_synthetic_capture(
+    out: Path,
+    *,
+    cameras: int = 16,
+    timesteps: int = 12,
+    size: tuple[int, int] = (256, 256),
+    seed: int = 0,
+    monocular: bool = False,
+    head: HeadModel | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Ray-trace a capture of a synthetic person in the VHAP / GaussianAvatars layout.
+
+    The person has a drawn identity, hair, clothed shoulders far wider than the bust, and muscles that move, none of
+    which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes
+    the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps and ``test`` all cameras
+    at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same arguments write the same
+    bytes.
+
+    Of a monocular capture, training and ``test`` are what its one camera, number 0, sees of a head that turns 20
+    degrees to either side; ``val`` is what it does not see: cameras 1 and 2 stand 60 degrees to either side and look
+    at six of the training timesteps.
+
+    Args:
+        out: Folder to make; it must be new or empty.
+        cameras: Number of cameras on a frontal arc of two rows; a monocular capture has one.
+        timesteps: Number of frames of each camera.
+        size: Image width and height [px].
+        seed: Draws the person and the motion.
+        monocular: One camera that sees the head turn, and two more that only ``val`` has.
+        head: The model that carries identity and motion; the procedural head by default.
+        progress: Called with the number of images made and their total.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        DataError: If ``out`` is not empty or cannot be made, or a number is too small.
+    """
+    out = Path(out)
+    _check(out, 1 if monocular else cameras, timesteps, size, monocular=monocular)
+    if head is None:
+        from mgavatar.head.procedural.build import build_head
+
+        head = build_head()
+    rng = np.random.default_rng(seed)
+    person = make_person(head, rng)
+    studio = Studio(person, make_look(person, rng))
+    poses = perform(head, timesteps, rng, turn=_TURN)
+    views = [front_camera(size), *side_cameras(size)] if monocular else frontal_arc(cameras, size)
+    partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    try:
+        partial.mkdir(parents=True)
+        members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
+        truth = _shoot_all(partial, studio, poses, views, members, progress)
+        _write_params(partial, head, tracked(poses, rng))
+        _write_transforms(partial, views, members)
+        _write_truth(partial, person, poses, seed, *truth)
+        if out.exists():
+            out.rmdir()
+        partial.rename(out)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise DataError(f"{out}: cannot write the capture ({reason}); choose another folder") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return out
+
+
+def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, monocular: bool) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DataError(f"{out}: already exists and is not an empty folder; choose another folder or remove it")
+    if cameras < 2 and not monocular:
+        raise DataError(
+            f"{out}: {cameras} cameras leave none to hold out; ask for 2 or more, or for a monocular capture"
+        )
+    if timesteps < 2:
+        raise DataError(f"{out}: {timesteps} timesteps cannot be split into training and test; ask for 2 or more")
+    if min(size) < 8:
+        raise DataError(f"{out}: images of {size[0]} x {size[1]} pixels show nothing; ask for 8 x 8 or more")
+
+
+Members = dict[Split, set[tuple[int, int]]]
+"""(timestep, camera) of the images of each split."""
+
+
+def _splits(n_cameras: int, timesteps: int) -> Members:
+    n_train = _n_train(timesteps)
+    every = {(t, c) for t in range(timesteps) for c in range(n_cameras)}
+    test = {(t, c) for t, c in every if t >= n_train}
+    val = {(t, c) for t, c in every - test if c == held_out_camera(n_cameras)}
+    return {"train": every - test - val, "val": val, "test": test}
+
+
+def _monocular_splits(n_cameras: int, timesteps: int) -> Members:
+    """Camera 0 is the capture's own; the others show what it has not seen."""
+    n_train = _n_train(timesteps)
+    chosen = np.linspace(0, n_train - 1, min(_SIDE_TIMESTEPS, n_train)).round().astype(int).tolist()
+    return {
+        "train": {(t, 0) for t in range(n_train)},
+        "val": {(t, c) for t in chosen for c in range(1, n_cameras)},
+        "test": {(t, 0) for t in range(n_train, timesteps)},
+    }
+
+
+def _n_train(timesteps: int) -> int:
+    return min(math.ceil(0.7 * timesteps), timesteps - 1)
+
+
+def _shoot_all(
+    root: Path,
+    studio: Studio,
+    poses: list[Pose],
+    views: list[Camera],
+    members: Members,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Write all images and masks; return the vertices [T, V, 3] and how many training images see each [V]."""
+    (root / "images").mkdir()
+    (root / "fg_masks").mkdir()
+    vertices, seen = [], np.zeros(len(studio.verts), np.int16)
+    every, done = set().union(*members.values()), 0
+    saved: list[Future[None]] = []
+    with ThreadPoolExecutor(1) as writer:
+        for t, pose in enumerate(poses):
+            studio.stage(pose)
+            vertices.append(studio.verts.astype(np.float32))
+            for c in sorted(c for at, c in every if at == t):
+                image, mask = studio.shoot(views[c])
+                saved.append(writer.submit(_save, image, root / "images" / _name(t, c)))
+                saved.append(writer.submit(_save, mask, root / "fg_masks" / _name(t, c)))
+                if (t, c) in members["train"]:
+                    seen += studio.seen(views[c])
+                done += 1
+                if progress is not None:
+                    progress(done, len(every))
+    for written in saved:
+        written.result()
+    return np.stack(vertices), seen
+
+
+def _name(t: int, c: int) -> str:
+    return f"{t:05d}_{c:02d}.png"
+
+
+def _save(pixels: np.ndarray, path: Path) -> None:
+    Image.fromarray(pixels).save(path, compress_level=1)
+
+
+def _write_params(root: Path, head: HeadModel, poses: list[Pose]) -> None:
+    (root / "flame_param").mkdir()
+    n_expr = max(head.n_expr, _N_EXPR)
+    for t, pose in enumerate(poses):
+        _save_arrays(root / "flame_param" / f"{t:05d}.npz", **_vhap(pose, n_expr))
+    still = Pose(np.zeros(head.n_expr), *(np.zeros(n) for n in (3, 3, 3, 6, 3)))
+    opened = {**_vhap(still, n_expr), "jaw_pose": np.array([[0.3, 0.0, 0.0]])}  # float64, as VHAP writes it
+    _save_arrays(root / "canonical_flame_param.npz", **opened)
+
+
+def _vhap(pose: Pose, n_expr: int) -> dict[str, np.ndarray]:
+    values = {
+        "expr": np.pad(pose.expr, (0, n_expr - len(pose.expr))),
+        "rotation": pose.rotation,
+        "neck_pose": pose.neck_pose,
+        "jaw_pose": pose.jaw_pose,
+        "eyes_pose": pose.eyes_pose,
+        "translation": pose.translation,
+    }
+    rows = {name: value[None].astype(np.float32) for name, value in values.items()}
+    return {"shape": np.zeros(_N_SHAPE, np.float32), **rows}
+
+
+def _write_transforms(root: Path, views: list[Camera], members: Members) -> None:
+    every = sorted(set().union(*members.values()))
+    for name, chosen in (("", every), *((f"_{split}", sorted(members[split])) for split in SPLITS)):
+        frames = [_frame(t, c, views[c]) for t, c in chosen]
+        lens = _lens(views[-1])
+        meta = {
+            "frames": frames,
+            **lens,
+            "timestep_indices": sorted({t for t, _ in chosen}),
+            "camera_indices": sorted({c for _, c in chosen}),
+        }
+        (root / f"transforms{name}.json").write_text(json.dumps(meta, indent=1), "utf-8")
+
+
+def _frame(t: int, c: int, camera: Camera) -> dict[str, Any]:
+    to_world = np.linalg.inv(camera.viewmat)
+    to_world[:3, 1:3] *= -1.0  # OpenGL axes
+    return {
+        "timestep_index": t,
+        "timestep_index_original": t,
+        "timestep_id": f"{t:05d}",
+        "camera_index": c,
+        "camera_id": f"{c:02d}",
+        **_lens(camera),
+        "transform_matrix": to_world.tolist(),
+        "file_path": f"images/{_name(t, c)}",
+        "fg_mask_path": f"fg_masks/{_name(t, c)}",
+        "flame_param_path": f"flame_param/{t:05d}.npz",
+    }
+
+
+def _lens(camera: Camera) -> dict[str, Any]:
+    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    return {
+        "cx": float(camera.K[0, 2]),
+        "cy": float(camera.K[1, 2]),
+        "fl_x": fx,
+        "fl_y": fy,
+        "h": camera.height,
+        "w": camera.width,
+        "camera_angle_x": 2 * math.atan(camera.width / (2 * fx)),
+        "camera_angle_y": 2 * math.atan(camera.height / (2 * fy)),
+    }
+
+
+def _write_truth(
+    root: Path, person: Person, poses: list[Pose], seed: int, vertices: np.ndarray, seen: np.ndarray
+) -> None:
+    (root / "ground_truth").mkdir()
+    motion = {
+        f"true_{name}": np.stack([getattr(pose, name) for pose in poses]).astype(np.float32)
+        for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+    }
+    _save_arrays(
+        root / "ground_truth" / "truth.npz",
+        vertices=vertices,
+        faces=person.faces,
+        seen=seen,
+        **{f"mask_{name}": mask for name, mask in person.masks.items()},
+        true_shape=person.betas.astype(np.float32),
+        **motion,
+        expr_basis=np.array(person.head.expr_basis),
+        head_model=np.array(person.head.name),
+        seed=np.array(seed),
+    )
+
+
+def _save_arrays(path: Path, **arrays: Any) -> None:
+    np.savez_compressed(path, **arrays)

@@ -1,0 +1,121 @@
+"""What a synthetic person does in front of the cameras, and what a tracker would make of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mgavatar.head.model import HeadModel
+from mgavatar.synthetic.person import Pose, vertex_regions
+
+_ACTIONS = {
+    "smile": ("smile",),
+    "brows": ("browinnerup", "browouterup", "browraise", "browup", "browsup"),
+    "blink": ("blink", "eyeclose", "lidclose"),
+    "round": ("pucker", "funnel"),
+    "stretch": ("stretch",),
+    "squint": ("squint", "cheekraise"),
+}
+"""What an action is called in the names of expression directions, without case and punctuation."""
+
+_REACH = {"smile": 0.9, "brows": 0.9, "blink": 1.0, "round": 0.6, "stretch": 0.5, "squint": 0.6}
+_LARGEST = 0.009
+"""No expression moves a vertex further than this [m], whatever the units of the model's directions; blinks may."""
+
+
+def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: float) -> list[Pose]:
+    """Smooth motion of ``timesteps`` frames: head turns and nods, speech, expressions, gaze, sway of the body.
+
+    Args:
+        head: The model whose expression directions are used.
+        timesteps: Number of frames, T.
+        rng: Draws phases.
+        turn: Largest turn of the head to a side [rad].
+    """
+    u = np.arange(timesteps) / max(timesteps - 1, 1)
+    expr = _expressions(head, u, rng)
+    phase = rng.uniform(-0.35, 0.35, 12)
+    yaw = turn * np.sin(2 * np.pi * 1.45 * u + phase[0])
+    pitch = 0.19 * np.sin(2 * np.pi * 1.0 * u + 0.9 + phase[1]) - 0.02
+    roll = 0.12 * np.sin(2 * np.pi * 1.25 * u + 2.0 + phase[2])
+    jaw = 0.02 + 0.17 * np.sin(np.pi * (2.6 * u + 0.15 + 0.2 * phase[3])) ** 4
+    gaze_x = 0.12 * np.sin(2 * np.pi * 1.1 * u + 1.0 + phase[4])
+    gaze_y = -0.35 * yaw + 0.16 * np.sin(2 * np.pi * 1.7 * u + phase[5])
+    sway = np.sin(np.outer(u, [5, 7, 6]) + phase[6:9]) * [0.027, 0.045, 0.022]
+    shift = np.sin(np.outer(u, [6, 8, 5]) + phase[9:12]) * [0.006, 0.003, 0.006]
+    zero = 0.0 * u
+    neck = np.stack([pitch, yaw, roll], axis=1)
+    eyes = np.stack([gaze_x, gaze_y, zero, gaze_x, gaze_y, zero], axis=1)
+    return [
+        Pose(expr[t], sway[t], neck[t], np.array([jaw[t], 0.012 * np.sin(9 * u[t]), 0.0]), eyes[t], shift[t])
+        for t in range(timesteps)
+    ]
+
+
+def tracked(poses: list[Pose], rng: np.random.Generator) -> list[Pose]:
+    """The same motion with a tracker's errors: 0.3 degrees, 0.5 mm and, where a direction is used, 0.03."""
+
+    def rotation(values: np.ndarray) -> np.ndarray:
+        return values + np.radians(0.3) * rng.standard_normal(values.shape)
+
+    used = np.any([pose.expr != 0 for pose in poses], axis=0)
+    return [
+        Pose(
+            expr=pose.expr + 0.03 * used * rng.standard_normal(pose.expr.shape),
+            rotation=rotation(pose.rotation),
+            neck_pose=rotation(pose.neck_pose),
+            jaw_pose=rotation(pose.jaw_pose),
+            eyes_pose=rotation(pose.eyes_pose),
+            translation=pose.translation + 5e-4 * rng.standard_normal(3),
+        )
+        for pose in poses
+    ]
+
+
+def action_columns(head: HeadModel) -> dict[str, np.ndarray]:
+    """Expression directions of each action: by name or, where names say nothing, by the region that they move."""
+    names = ["".join(c for c in name.lower() if c.isalnum()) for name in head.expr_names]
+    found = {
+        action: np.array([i for i, name in enumerate(names) if any(word in name for word in words)], int)
+        for action, words in _ACTIONS.items()
+    }
+    found = {action: columns for action, columns in found.items() if len(columns)}
+    return found or _columns_by_region(head)
+
+
+def _columns_by_region(head: HeadModel) -> dict[str, np.ndarray]:
+    """The direction that is most concentrated in the mouth, in the brows and in the eyes."""
+    motion = np.linalg.norm(head.shapedirs[:, :, head.n_shape :], axis=1)  # [V, E]
+    points = head.v_template - (head.J_regressor @ head.v_template)[3:].mean(0)
+    front = (points[:, 2] > -0.03) & vertex_regions(head)["skin"]
+    height = points[:, 1]
+    boxes = {
+        "smile": front & (np.abs(height + 0.055) < 0.02),
+        "brows": front & (np.abs(height - 0.022) < 0.012),
+        "squint": front & (np.abs(height) < 0.01),
+    }
+    energy = np.maximum((motion**2).sum(0), 1e-20)
+    taken: dict[str, np.ndarray] = {}
+    for action, box in boxes.items():
+        share = (motion[box] ** 2).sum(0) / energy
+        share[[int(c[0]) for c in taken.values()]] = -1.0
+        if len(share) > len(taken):
+            taken[action] = np.array([int(np.argmax(share))])
+    return taken
+
+
+def _expressions(head: HeadModel, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Coefficients over time, shape [T, n_expr]."""
+    expr = np.zeros((len(u), head.n_expr))
+    for i, (action, columns) in enumerate(action_columns(head).items()):
+        phase = rng.uniform(0.0, 1.0)
+        wave = np.sin(np.pi * ((1.3 + 0.45 * i) * u + phase)) ** 2
+        if action == "blink":
+            wave = np.clip(3.0 * np.sin(np.pi * (2.2 * u + 0.6 + 0.3 * phase)) ** 8 - 0.4, 0.0, 1.0)
+        for column in columns:
+            expr[:, column] += _REACH[action] * wave * _unit(head, int(column), action)
+    return expr
+
+
+def _unit(head: HeadModel, column: int, action: str) -> float:
+    largest = float(np.linalg.norm(head.shapedirs[:, :, head.n_shape + column], axis=1).max())
+    return 1.0 if action == "blink" else min(1.0, _LARGEST / max(largest, 1e-9))

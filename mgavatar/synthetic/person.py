@@ -1,0 +1,280 @@
+"""A person that the head model cannot express: an identity of the model with hair, a garment and muscles that move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mgavatar.head.model import HeadModel
+from mgavatar.synthetic.garment import drape
+
+SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
+"""Materials, numbered as in kernels/portrait.py."""
+
+_MIN_FACES = 30_000
+"""The head is subdivided until hair and silhouette have at least this many faces, at most twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """True parameters of one timestep: FLAME's, float64; angles are rotation vectors [rad]."""
+
+    expr: np.ndarray
+    rotation: np.ndarray
+    neck_pose: np.ndarray
+    jaw_pose: np.ndarray
+    eyes_pose: np.ndarray
+    translation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """The surface of a synthetic person; head vertices come first, then the garment's.
+
+    Attributes:
+        head: The model that carries the motion.
+        betas: True identity coefficients, shape [n_shape].
+        fine: Takes values of the model's vertices to the subdivided head, sparse, shape [H, V].
+        faces: Vertex indices, shape [F, 3], int32.
+        kinds: Material of each face, shape [F], int32.
+        hair: Rest offsets of the head's vertices that make the hair [m], shape [H, 3].
+        garment: Rest vertices of the garment [m], shape [G, 3].
+        lbs_weights: Of all vertices, shape [H + G, 5].
+        rest: Resting point of each vertex in the template, from the middle of the eyes [m], shape [H + G, 3].
+        marks: Hair, lips, collar of each vertex, 0..1, shape [H + G, 3].
+        masks: Named vertex regions, each shape [H + G], bool.
+    """
+
+    head: HeadModel
+    betas: np.ndarray
+    fine: sp.csr_matrix
+    faces: np.ndarray
+    kinds: np.ndarray
+    hair: np.ndarray
+    garment: np.ndarray
+    lbs_weights: np.ndarray
+    rest: np.ndarray
+    marks: np.ndarray
+    masks: dict[str, np.ndarray]
+
+    def posed(self, pose: Pose | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices in world space [m], shape [H + G, 3], and the rotation of each, shape [H + G, 3, 3], float64.
+
+        FLAME's forward function (linear blend skinning about joints regressed from the shaped vertices), then muscles
+        and hair that follow the neck.
+        """
+        pose = pose or _rest_pose(self.head)
+        shaped = shaped_vertices(self.head, self.betas, pose.expr)
+        joints = self.head.J_regressor.astype(np.float64) @ shaped
+        rotvecs = np.concatenate([pose.rotation, pose.neck_pose, pose.jaw_pose, pose.eyes_pose]).reshape(5, 3)
+        rotations = Rotation.from_rotvec(rotvecs).as_matrix()
+        shaped = shaped + self.head.posedirs.astype(np.float64) @ (rotations[1:] - np.eye(3)).reshape(-1)
+        moved = np.concatenate([self.fine @ shaped + self.hair, self.garment]) + self._correctives(pose.neck_pose)
+        transforms = _joint_transforms(rotations, joints, self.head.parents)
+        blended = np.einsum("vj,jab->vab", self.lbs_weights, transforms)
+        verts = np.einsum("vab,vb->va", blended[:, :3, :3], moved) + blended[:, :3, 3] + pose.translation
+        return verts, blended[:, :3, :3]
+
+    def _correctives(self, neck_pose: np.ndarray) -> np.ndarray:
+        """Millimetres that skinning does not give, a smooth function of the neck's rotation, shape [H + G, 3] [m]."""
+        pitch, yaw, roll = neck_pose
+        x, y, z = self.rest.T
+        side = np.tanh(x / 0.02)
+        strand = np.exp(-0.5 * (((np.abs(x) - 0.035) / 0.018) ** 2 + ((y + 0.13) / 0.035) ** 2)) * (z > -0.11)
+        bulge = 0.012 * np.sin(yaw) * strand * side  # the muscle opposite to the turn stands out
+        shrug = np.exp(-0.5 * (((np.abs(x) - 0.12) / 0.06) ** 2 + ((y + 0.16) / 0.06) ** 2))
+        out = np.zeros_like(self.rest)
+        out[:, 0] = bulge * side
+        out[:, 1] = 0.018 * shrug * (np.abs(np.sin(yaw)) * 0.5 + np.maximum(side * np.sin(-roll), 0.0))
+        out[:, 2] = np.abs(bulge) + 0.008 * shrug * np.sin(pitch)
+        sway = np.clip(np.linalg.norm(np.pad(self.hair, ((0, len(self.garment)), (0, 0))), axis=1) / 0.03, 0.0, 1.5)
+        low = np.clip((0.06 - y) / 0.12, 0.0, 1.0) * sway
+        out += low[:, None] * np.array([-0.016 * np.sin(yaw) + 0.012 * np.sin(roll), 0.0, -0.012 * np.sin(pitch)])
+        return out
+
+
+def make_person(head: HeadModel, rng: np.random.Generator) -> Person:
+    """Draw identity, hair style and garment."""
+    betas = 0.7 * np.clip(rng.standard_normal(head.n_shape), -2.0, 2.0)
+    neutral = np.zeros(head.n_expr)
+    shaped = shaped_vertices(head, betas, neutral)
+    fine, head_faces = subdivision(head.faces, len(shaped))
+    eyes = (head.J_regressor.astype(np.float64) @ head.v_template)[3:]
+    rest = fine @ (head.v_template - eyes.mean(0))
+    regions = {name: fine @ mask.astype(np.float64) for name, mask in vertex_regions(head).items()}
+    cover, hair = comb(rest, fine @ shaped, head_faces, regions, rng)
+    middle = (head.J_regressor.astype(np.float64) @ shaped)[3:].mean(0)
+    garment, garment_faces, collar = drape(shaped - middle, head.faces, rng)
+    weights = _all_weights(fine, head, shaped, garment + middle)
+    n_head, n_cloth = len(rest), len(garment)
+    marks = np.zeros((n_head + n_cloth, 3))
+    marks[:n_head, 0], marks[:n_head, 1], marks[n_head:, 2] = cover, regions["lips"], collar
+    masks = {name: np.concatenate([values > 0.999, np.zeros(n_cloth, bool)]) for name, values in regions.items()}
+    masks["hair"] = np.concatenate([cover > 0.5, np.zeros(n_cloth, bool)])
+    masks["face"] &= ~masks["hair"]
+    masks["shoulders"] = np.concatenate([np.zeros(n_head, bool), np.ones(n_cloth, bool)])
+    return Person(
+        head=head,
+        betas=betas,
+        fine=fine,
+        faces=np.concatenate([head_faces, garment_faces + n_head]).astype(np.int32),
+        kinds=np.concatenate([_materials(head_faces, regions), np.full(len(garment_faces), CLOTH)]).astype(np.int32),
+        hair=hair,
+        garment=garment + middle,
+        lbs_weights=weights,
+        rest=np.concatenate([rest, garment]),
+        marks=marks,
+        masks=masks,
+    )
+
+
+def shaped_vertices(head: HeadModel, betas: np.ndarray, expr: np.ndarray) -> np.ndarray:
+    """Vertices with identity and expression, before pose correctives [m], shape [V, 3], float64."""
+    return head.v_template.astype(np.float64) + head.shapedirs.astype(np.float64) @ np.concatenate([betas, expr])
+
+
+def subdivision(faces: np.ndarray, n_verts: int) -> tuple[sp.csr_matrix, np.ndarray]:
+    """Midpoint subdivision as a sparse matrix [H, V], and its faces; none where the mesh is fine enough already."""
+    fine = sp.identity(n_verts, format="csr")
+    for _ in range(2):
+        if len(faces) >= _MIN_FACES:
+            break
+        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
+        edges, inverse = np.unique(sides, axis=0, return_inverse=True)
+        middle = inverse.reshape(-1, 3) + fine.shape[0]
+        rows = np.repeat(np.arange(len(edges)), 2)
+        halves = sp.csr_matrix((np.full(2 * len(edges), 0.5), (rows, edges.ravel())), (len(edges), fine.shape[0]))
+        fine = sp.vstack([fine, halves @ fine], format="csr")
+        (a, b, c), (ab, bc, ca) = faces.T, middle.T
+        quarters = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
+        faces = np.concatenate([np.stack(corner, axis=1) for corner in quarters])
+    return fine, faces
+
+
+def vertex_regions(head: HeadModel) -> dict[str, np.ndarray]:
+    """The model's masks; regions that it does not name are measured from skinning weights and positions."""
+    points = head.v_template - (head.J_regressor @ head.v_template)[3:].mean(0)
+    x, y, z = points.T
+    regions = dict(head.masks)
+    regions.setdefault("eyeballs", head.lbs_weights[:, 3:].max(1) > 0.5)
+    regions.setdefault("teeth", np.zeros(len(x), bool))
+    skin = ~(regions["eyeballs"] | regions["teeth"])
+    for inside in ("mouth_socket", "mouth", "mouth_interior"):
+        skin &= ~regions.get(inside, np.zeros(len(x), bool))
+    mouth = (x / 0.026) ** 2 + ((y - _mouth_height(points, head.lbs_weights[:, 2], skin)) / 0.0125) ** 2 < 1.0
+    regions.setdefault("lips", mouth & skin & (z > 0.0))
+    ear = ((y + 0.024) / 0.040) ** 2 + ((z + 0.082) / 0.023) ** 2 < 1.0
+    regions.setdefault("ears", ear & (np.abs(x) > 0.06) & skin)
+    regions.setdefault("face", (z > -0.045) & (y > -0.115) & skin)
+    regions.setdefault("scalp", (y > -0.09) & skin & ~regions["face"])
+    regions["skin"] = skin
+    return regions
+
+
+def _mouth_height(points: np.ndarray, jaw: np.ndarray, skin: np.ndarray) -> float:
+    """Where, at the front of the face, the skin stops following the skull and starts following the jaw [m]."""
+    front = skin & (np.abs(points[:, 0]) < 0.01) & (points[:, 2] > 0.015) & (points[:, 1] < -0.03)
+    upper, lower = front & (jaw < 0.5), front & (jaw >= 0.5)
+    if not upper.any() or not lower.any():
+        return -0.066
+    return 0.5 * float(points[upper, 1].min() + points[lower, 1].max())
+
+
+def hairline(around: np.ndarray) -> np.ndarray:
+    """Height of the hairline above the eyes [m] at an angle from the front [rad] about the skull's vertical axis."""
+    degrees = [0, 25, 50, 66, 78, 88, 104, 116, 128, 150, 180]
+    heights = [0.070, 0.069, 0.060, 0.030, -0.018, 0.018, 0.022, -0.02, -0.062, -0.082, -0.090]
+    return np.interp(np.degrees(around), degrees, heights)
+
+
+def comb(
+    rest: np.ndarray, shaped: np.ndarray, faces: np.ndarray, regions: dict[str, np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Hair of a drawn style: its cover, 0..1, shape [H], and its offsets from the scalp [m], shape [H, 3]."""
+    top, side, fall, wave = rng.uniform([0.012, 0.009, 0.0, 1.5], [0.028, 0.022, 0.05, 6.0])
+    fall = 0.0 if fall < 0.018 else fall  # short hair has no fall
+    parting, phases = rng.uniform(-0.9, 0.9), rng.uniform(0.0, 2 * np.pi, 8)
+    x, y, z = rest.T
+    around = np.arctan2(x, z + 0.065)
+    above = np.arctan2(y - 0.02, np.hypot(x, z + 0.065))
+    line = hairline(np.abs(around)) + 0.0035 * np.sin(9 * around + phases[0])
+    ears = np.clip(regions["ears"], 0.0, 1.0)
+    grows = regions["skin"] * (1.0 - ears)
+    cover = _ramp(y - line, -0.005, 0.009) * grows
+    rise = _ramp(y - line, -0.004, 0.030) * cover
+    clumps = _clumps(around, above, wave, phases)
+    thick = top * _ramp(y, 0.0, 0.09) + side * (1.0 - _ramp(y, 0.0, 0.09))
+    thick *= 1.0 - 0.35 * np.exp(-0.5 * ((around - parting) / 0.10) ** 2) * (np.abs(above) > 0.7)
+    normals = vertex_normals(shaped, faces)
+    outward = rest - np.array([0.0, 0.02, -0.065])
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    direction = 0.55 * normals + 0.45 * outward
+    offsets = direction * (thick * rise * (0.72 + 0.45 * clumps))[:, None]
+    fringe = np.exp(-0.5 * (around / 0.75) ** 2) * _ramp(y, 0.045, 0.075) * cover
+    sweep = 0.5 * top * np.array([0.25 * np.sign(parting), -0.35, 0.75])
+    offsets += (fringe * (0.6 + 0.6 * clumps))[:, None] * sweep
+    hang = fall * cover * _ramp(-y, -0.05, 0.08) * _ramp(np.abs(around), 1.3, 2.1)
+    offsets += hang[:, None] * (np.array([0.0, -1.0, 0.0]) + 0.35 * outward) * (0.8 + 0.4 * clumps)[:, None]
+    return cover, offsets
+
+
+def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals weighted by area, shape [V, 3]."""
+    a, b, c = verts[faces[:, 0]], verts[faces[:, 1]], verts[faces[:, 2]]
+    areas = np.cross(b - a, c - a)
+    rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
+    normals = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), (len(verts), len(faces))) @ areas
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
+
+
+def _ramp(x: np.ndarray, low: float, high: float) -> np.ndarray:
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _clumps(around: np.ndarray, above: np.ndarray, wave: float, phases: np.ndarray) -> np.ndarray:
+    """Locks that run from the crown outwards, 0..1: ridges in the angle, bent by waves."""
+    bent = around + 0.12 * np.sin(wave * above + phases[1]) + 0.06 * np.sin(2.3 * wave * above + phases[2])
+    ridges = np.abs(np.sin(7 * bent + phases[3] + 0.8 * np.sin(3 * bent + phases[4])))
+    small = np.abs(np.sin(17 * bent + phases[5] + 2.0 * above))
+    return 0.65 * ridges + 0.35 * small
+
+
+def _materials(faces: np.ndarray, regions: dict[str, np.ndarray]) -> np.ndarray:
+    kinds = np.full(len(faces), SKIN)
+    parts = {"mouth_socket": MOUTH, "mouth": MOUTH, "mouth_interior": MOUTH, "teeth": TEETH, "eyeballs": EYE}
+    for name, kind in parts.items():
+        if name in regions:
+            kinds[(regions[name][faces] > 0.999).all(axis=1)] = kind
+    return kinds
+
+
+def _all_weights(fine: sp.csr_matrix, head: HeadModel, shaped: np.ndarray, garment: np.ndarray) -> np.ndarray:
+    """Skinning weights of head and garment; cloth near the neck moves with it, the rest with the body."""
+    weights = head.lbs_weights.astype(np.float64)
+    distance, nearest = cKDTree(shaped).query(garment)
+    near = np.exp(-np.maximum(distance - 0.006, 0.0) / 0.02)[:, None]
+    body = np.eye(5)[:1]
+    return np.concatenate([fine @ weights, near * weights[nearest] + (1.0 - near) * body])
+
+
+def _joint_transforms(rotations: np.ndarray, joints: np.ndarray, parents: np.ndarray) -> np.ndarray:
+    """Rest to world of each joint, shape [5, 4, 4]."""
+    world: list[np.ndarray] = []
+    for j, parent in enumerate(parents):
+        local = np.eye(4)
+        local[:3, :3] = rotations[j]
+        local[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0.0)
+        world.append(world[parent] @ local if parent >= 0 else local)
+    stacked = np.stack(world)
+    stacked[:, :3, 3] -= np.einsum("jab,jb->ja", stacked[:, :3, :3], joints)
+    return stacked
+
+
+def _rest_pose(head: HeadModel) -> Pose:
+    zero = np.zeros(3)
+    return Pose(np.zeros(head.n_expr), zero, zero, zero, np.zeros(6), zero)
