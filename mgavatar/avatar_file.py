@@ -18,14 +18,14 @@ from mgavatar.camera import Camera
 from mgavatar.capture.info import CaptureInfo
 from mgavatar.config import FitConfig, check, from_dict
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write, existing_file
+from mgavatar.files import atomic_write, existing_file, one_line
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
 from mgavatar.head.load import head_arrays, head_from_arrays
 from mgavatar.head.params import HeadParams
 
-FORMAT = "mgavatar/2"
+FORMAT = "mgavatar/3"
 
 _NOT_DRAWN = ("exp_avg", "exp_avg_sq", "step")
 """Parts of a state that only an optimizer needs."""
@@ -113,9 +113,33 @@ def _read(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not an MGAvatar avatar; give the avatar.pt that `mgavatar fit` wrote") from error
     if not isinstance(payload, dict) or not str(payload.get("format", "")).startswith("mgavatar/"):
         raise DataError(f"{path}: not an MGAvatar avatar; give the avatar.pt that `mgavatar fit` wrote")
-    if payload["format"] != FORMAT:
-        raise DataError(f"{path}: format {payload['format']}, this version reads {FORMAT}; use a matching mgavatar")
+    while payload["format"] != FORMAT:
+        upgrade = _UPGRADES.get(payload["format"])
+        if upgrade is None:
+            known = ", ".join((*_UPGRADES, FORMAT))
+            raise DataError(
+                f"{path}: format {one_line(payload['format'], limit=40)}, this version reads {known}; "
+                "fit the avatar again or use the mgavatar that wrote it"
+            )
+        try:
+            payload = upgrade(payload)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise DataError(f"{path}: damaged avatar ({_brief(error)}); fit it again") from error
     return payload
+
+
+def _from_format_2(payload: dict[str, Any]) -> dict[str, Any]:
+    """Upgrade a file of format 2: joints were called ``neck``, ``jaw``, ``eyes``, the last rate ``final_lr``."""
+    for stage in ("geometry", "appearance"):
+        table = payload["config"][stage]
+        table["lr_final_factor"] = table.pop("final_lr")
+    for name in ("neck", "jaw", "eyes"):
+        payload["geometry"][f"head.poses.{name}_pose"] = payload["geometry"].pop(f"head.poses.{name}")
+    return payload | {"format": "mgavatar/3"}
+
+
+_UPGRADES = {"mgavatar/2": _from_format_2}
+"""From each past format to the next one."""
 
 
 def _appearance(head: PersonalHead, config: FitConfig, state: dict[str, Tensor], n: int) -> Appearance:

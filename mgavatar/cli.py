@@ -212,8 +212,8 @@ def _say_notes(notes: list[str]) -> None:
 def _score_lines(metrics: dict[str, Any]) -> list[str]:
     lines = []
     for split, score in metrics["splits"].items():
-        trivial = max(score["trivial"].values()) if score.get("trivial") else None
-        beside = f" (best trivial predictor {trivial:.2f})" if trivial is not None else ""
+        naive = max(score["naive"].values()) if score.get("naive") else None
+        beside = f" (best naive baseline {naive:.2f})" if naive is not None else ""
         lines.append(f"{split} ({score['task']}): PSNR {score['psnr']:.2f} dB{beside}, SSIM {score['ssim']:.4f}")
     if metrics["geometry"]:
         lines.append(f"geometry: mean {metrics['geometry']['mean_mm']:.2f} mm from the ground truth")

@@ -54,7 +54,7 @@ class GeometryConfig:
     lr_scale: float = 5e-3
     """Logarithm of the Gaussians' scales."""
     lr_color: float = 2e-2
-    final_lr: float = 0.1
+    lr_final_factor: float = 0.1
     """All rates fall exponentially to this share of themselves."""
     ssim: float | None = None
     """Weight of 1 - SSIM at the end of this stage, to which it moves steadily from that of ``loss`` (Eq. 4), with the
@@ -174,7 +174,7 @@ class AppearanceConfig:
     lr_scales: float = 1.7e-2
     lr_quats: float = 1e-3
     lr_opacities: float = 5e-2
-    final_lr: float = 0.1
+    lr_final_factor: float = 0.1
     """All rates fall exponentially to this share of themselves."""
     initial_scale: float = 0.5
     """Sigma along the face at the start, in units of k."""
@@ -376,11 +376,11 @@ def check(config: FitConfig) -> None:
         ("geometry.subdivisions", g.subdivisions, 0, 3),
         ("geometry.triplane-resolution", g.triplane_resolution, 2, 1024),
         ("geometry.hidden", g.hidden, 1, 4096),
-        ("geometry.final-lr", g.final_lr, 1e-6, 1.0),
+        ("geometry.lr-final-factor", g.lr_final_factor, 1e-6, 1.0),
         ("geometry.ssim", 0.0 if g.ssim is None else g.ssim, 0.0, 1.0),
         ("geometry.initial-scale", g.initial_scale, 0.01, 10.0),
         ("appearance.iterations", a.iterations, 1, 10_000_000),
-        ("appearance.final-lr", a.final_lr, 1e-6, 1.0),
+        ("appearance.lr-final-factor", a.lr_final_factor, 1e-6, 1.0),
         ("appearance.initial-opacity", a.initial_opacity, 0.01, 0.999),
         ("appearance.color-net.levels", a.color_net.levels, 1, 32),
         ("appearance.color-net.max-resolution", a.color_net.max_resolution, a.color_net.base_resolution, 1_048_576),

@@ -395,7 +395,7 @@ def test_position_maps_show_the_face_without_its_root_motion(subject):
     rooted = frozen.posed(replace(pose, rotation=pose.rotation + 0.5, translation=pose.translation + 0.3))
     assert torch.equal(rooted.pose_map, base.pose_map)
     assert not torch.allclose(rooted.verts, base.verts)
-    assert not torch.allclose(frozen.posed(replace(pose, jaw=pose.jaw + 0.5)).pose_map, base.pose_map)
+    assert not torch.allclose(frozen.posed(replace(pose, jaw_pose=pose.jaw_pose + 0.5)).pose_map, base.pose_map)
     assert 0.5 < frozen.canonical_map.abs().max() <= 1.0
     assert base.theta.shape == (N_THETA,)
 
@@ -443,7 +443,9 @@ def test_the_yardstick_is_the_mesh(subject):
 
 def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
     """Each group its own rate, and all of them the stated share of it at the end."""
-    stage = make_stage(subject, tiny_config(appearance={"iterations": 5, "final_lr": 0.5, "density": NO_DENSITY}))
+    stage = make_stage(
+        subject, tiny_config(appearance={"iterations": 5, "lr_final_factor": 0.5, "density": NO_DENSITY})
+    )
     a = stage.config.appearance
     start = [a.lr_means, a.lr_scales, a.lr_quats, a.lr_opacities, a.color_net.lr, a.offset_net.lr]
     assert [group["lr"] for group in stage.optimizer.param_groups] == start

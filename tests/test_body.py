@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from mgavatar.head.body import FINE_ENOUGH, Body
 from mgavatar.head.model import HeadModel
-from mgavatar.head.params import HeadParams, Pose, fitted, pose_of
+from mgavatar.head.params import HeadParams, Pose, pad_or_truncate, pose_of
 from mgavatar.head.procedural.build import build_head
 from mgavatar.head.subdivide import subdivide
 
-ROTATIONS = ("rotation", "neck", "jaw", "eyes")
+ROTATIONS = ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
 
 
 @pytest.fixture(scope="module", params=["ball", "built"])
@@ -29,7 +29,7 @@ def model(request) -> HeadModel:
 def random_pose(model: HeadModel, *, seed: int, angle: float = 0.5) -> Pose:
     """Large rotations of all joints, a strong expression and a translation."""
     rng = np.random.default_rng(seed)
-    widths = {"expr": model.n_expr, "rotation": 3, "neck": 3, "jaw": 3, "eyes": 6, "translation": 3}
+    widths = {"expr": model.n_expr, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
     values = {name: rng.normal(0.0, angle if name in ROTATIONS else 0.7, width) for name, width in widths.items()}
     return Pose(**{name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()})
 
@@ -134,7 +134,7 @@ def test_a_centered_pose_keeps_the_face():
     centered = pose.centered()
     assert not centered.rotation.any()
     assert not centered.translation.any()
-    for name in ("expr", "neck", "jaw", "eyes"):
+    for name in ("expr", "neck_pose", "jaw_pose", "eyes_pose"):
         assert torch.equal(getattr(centered, name), getattr(pose, name))
 
 
@@ -176,7 +176,7 @@ def test_automatic_subdivision_goes_by_the_number_of_vertices():
 def test_coefficients_are_cut_or_padded(n):
     """Any number of them fits any head: the rest is zero, or is left out."""
     values = np.arange(1.0, 7.0).reshape(2, 3)
-    out = fitted(values, n)
+    out = pad_or_truncate(values, n)
     assert out.dtype == np.float32
     assert out.shape == (2, n)
     assert np.array_equal(out[:, : min(n, 3)], values[:, : min(n, 3)])

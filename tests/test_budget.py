@@ -44,10 +44,10 @@ class Clock:
 
 def run_stage(budget: Budget, clock: Clock, cost: Cost, *, iterations: int = 500, share: float = 1.0) -> list[float]:
     """Go through a stage's schedule; the places after each iteration."""
-    pace = budget.pace(iterations, share=share, must_fit=False)
+    pacer = budget.pacer(iterations, share=share, must_fit=False)
     places = [0.0]
     while iterations - places[-1] > 1e-6:
-        places.append(places[-1] + pace.advance(places[-1]))
+        places.append(places[-1] + pacer.schedule_step(places[-1]))
         clock.now += cost(len(places) - 1, places[-1] / iterations)
         assert len(places) < 1_000_000
     return places
@@ -154,10 +154,10 @@ def test_a_budget_that_cannot_work_is_refused_once_the_pace_is_known():
     def tried(seconds: float) -> None:
         budget = Budget(seconds, clock=clock)
         clock.now += 12.0
-        pace = budget.pace(500, share=GEOMETRY_SHARE, must_fit=True)
+        pacer = budget.pacer(500, share=GEOMETRY_SHARE, must_fit=True)
         place = 0.0
         for _ in range(6):
-            place += pace.advance(place)
+            place += pacer.schedule_step(place)
             clock.now += 2.0
 
     with pytest.raises(TooShort, match=r"--budget 60s: .* took 18 s .*takes 2\.00 s; give at least (.*)") as error:
@@ -272,7 +272,7 @@ def test_a_fit_ends_with_its_budget(seconds, n, subject, tmp_path, monkeypatch):
     for name, iterations in (("geometry", 40), ("appearance", 120)):
         assert sum(timed.advances[name]) == pytest.approx(iterations)
         stage = timed.last[name]
-        share = stage.config.geometry.final_lr if name == "geometry" else stage.config.appearance.final_lr
+        share = stage.config.geometry.lr_final_factor if name == "geometry" else stage.config.appearance.lr_final_factor
         start = config.geometry.lr_refine if name == "geometry" else config.appearance.lr_means
         assert stage.optimizer.param_groups[0]["lr"] == pytest.approx(share * start)
     longest = max(timed.advances["appearance"])

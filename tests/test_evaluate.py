@@ -21,7 +21,7 @@ from mgavatar.errors import DataError
 from mgavatar.head.params import Pose
 from mgavatar.kernels.rasterize import Rendering
 from mgavatar.losses import ssim
-from mgavatar.scoring.baselines import TrivialPredictors, pose_distances
+from mgavatar.scoring.baselines import NaiveBaselines, pose_distances
 from mgavatar.scoring.evaluate import evaluate, evaluate_sample, write_metrics
 from mgavatar.scoring.image_metrics import psnr
 from mgavatar.scoring.lpips import Lpips, load_lpips, weight_shapes
@@ -75,7 +75,7 @@ def test_metrics_of_a_known_image(pair: tuple[Avatar, Subject], monkeypatch: pyt
     for split, task in (("val", "novel-view"), ("test", "self-reenactment")):
         score, images = metrics["splits"][split], _images(subject, split)
         assert set(score) == {
-            "task", "frames", "cameras", "timesteps", "psnr", "ssim", "lpips", "lpips_reason", "trivial",
+            "task", "frames", "cameras", "timesteps", "psnr", "ssim", "lpips", "lpips_reason", "naive",
         }  # fmt: skip
         assert score["task"] == task
         assert score["frames"] == len(images)
@@ -85,9 +85,9 @@ def test_metrics_of_a_known_image(pair: tuple[Avatar, Subject], monkeypatch: pyt
         assert score["ssim"] == pytest.approx(expected, abs=1e-6)
         assert score["lpips"] is None
         assert score["lpips_reason"] == "no weights given (--lpips-weights)"
-        assert score["trivial"]["white"] == pytest.approx(np.mean([_db(1.0, image) for image in images]), abs=1e-4)
+        assert score["naive"]["white"] == pytest.approx(np.mean([_db(1.0, image) for image in images]), abs=1e-4)
         mean = _images(subject, "train").mean(axis=0)
-        assert score["trivial"]["mean_image"] == pytest.approx(np.mean([_db(mean, i) for i in images]), abs=1e-4)
+        assert score["naive"]["mean_image"] == pytest.approx(np.mean([_db(mean, i) for i in images]), abs=1e-4)
     assert (metrics["splits"]["val"]["cameras"], metrics["splits"]["val"]["timesteps"]) == (1, 3)
     assert done[-1] == (6, 6)
 
@@ -97,7 +97,7 @@ def test_refined_poses_only_where_the_fit_has_seen_them(
 ) -> None:
     """Training timesteps of the own capture as refined, all others as tracked."""
     avatar, subject = pair
-    avatar.head.poses["jaw"] += 1.0
+    avatar.head.poses["jaw_pose"] += 1.0
     jaws = torch.from_numpy(subject.params.jaw_pose)
     poses = _fake_renderer(avatar, monkeypatch)
     evaluate(avatar, subject, avatar_path=Path("a.pt"), splits=("val", "test"))
@@ -106,12 +106,12 @@ def test_refined_poses_only_where_the_fit_has_seen_them(
     assert any(t in seen for t in times)
     assert not all(t in seen for t in times)
     for pose, t in zip(poses, times, strict=True):
-        assert torch.allclose(pose.jaw, jaws[t] + (1.0 if t in seen else 0.0))
+        assert torch.allclose(pose.jaw_pose, jaws[t] + (1.0 if t in seen else 0.0))
     poses.clear()
     other = replace(subject, params=replace(subject.params, jaw_pose=subject.params.jaw_pose + 0.5))
     evaluate(avatar, other, avatar_path=Path("a.pt"), splits=("val", "test"))
     for pose, t in zip(poses, times, strict=True):
-        assert torch.allclose(pose.jaw, jaws[t] + 0.5)
+        assert torch.allclose(pose.jaw_pose, jaws[t] + 0.5)
 
 
 def test_samples_and_missing_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +125,7 @@ def test_samples_and_missing_splits(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     alone = replace(subject, frames={**subject.frames, "test": ()})
     metrics = evaluate_sample(avatar, alone, avatar_path=Path("a.pt"))
     assert metrics["splits"]["train"]["task"] == "training-views"
-    assert "nearest_frame" not in metrics["splits"]["train"]["trivial"]
+    assert "nearest_frame" not in metrics["splits"]["train"]["naive"]
 
 
 def test_training_images_are_never_scored(
@@ -176,14 +176,14 @@ def test_nearest_frame_by_hand(pair: tuple[Avatar, Subject]) -> None:
     rotation[:, 1] = [0.0, 0.5, 1.0, 0.0]
     neck[:, 1] = [0.0, 0.0, 0.0, 0.6]  # timestep 3 turns its neck as far as timestep 1, about, turns its root
     params = replace(subject.params, rotation=rotation, neck_pose=neck, **still)
-    trivial = TrivialPredictors(replace(subject, params=params))
+    naive = NaiveBaselines(replace(subject, params=params))
     tests = {frame.camera_id: frame for frame in subject.frames["test"]}
     assert {frame.camera_id for frame in subject.frames["train"]} == {0, 1}
     for camera, expected in ((0, 0), (1, 1), (2, 1)):
-        nearest = trivial.nearest_frame(tests[camera])
+        nearest = naive.nearest_frame(tests[camera])
         assert nearest is not None
         assert (nearest.camera_id, nearest.timestep) == (expected, 1)
-    assert trivial.nearest_frame(subject.frames["train"][0]) is None
+    assert naive.nearest_frame(subject.frames["train"][0]) is None
 
 
 def test_pose_distance_weighs_what_moves(pair: tuple[Avatar, Subject]) -> None:
@@ -200,14 +200,14 @@ def test_pose_distance_weighs_what_moves(pair: tuple[Avatar, Subject]) -> None:
     assert pose_distances(replace(params, translation=turned), 0)[1] == pytest.approx(0.1, rel=1e-5)
 
 
-def test_trivial_predictors_on_real_data(real_data: Path) -> None:
+def test_naive_baselines_on_real_data(real_data: Path) -> None:
     """The table in the data's own description."""
     subject = read_capture(real_data / "subjects/lps_multiview")
-    trivial = TrivialPredictors(subject)
+    naive = NaiveBaselines(subject)
     table = {"val": (10.69, 18.92, 19.22), "test": (10.44, 17.87, 21.02)}
     for split, expected in table.items():
         frames = subject.frames[split]  # type: ignore[index]
-        scores = [trivial.scores(frame, read_images([frame])[0].float() / 255.0) for frame in frames]
+        scores = [naive.scores(frame, read_images([frame])[0].float() / 255.0) for frame in frames]
         means = [np.mean([score[name] for score in scores]) for name in ("white", "mean_image", "nearest_frame")]
         assert means == pytest.approx(expected, abs=0.006)
 
@@ -324,5 +324,5 @@ def test_images_of_a_size_that_training_lacks_have_no_mean_and_no_nearest(pair: 
     _, subject = pair
     frame = subject.frames["val"][0]
     large = replace(frame, camera=frame.camera.scaled(48, 64))
-    scores = TrivialPredictors(subject).scores(large, torch.zeros(3, 64, 48))
+    scores = NaiveBaselines(subject).scores(large, torch.zeros(3, 64, 48))
     assert scores == {"white": 0.0, "mean_image": None, "nearest_frame": None}

@@ -196,7 +196,7 @@ def test_without_a_geometry_stage(subject, tmp_path):
     head = Avatar.load(run.avatar).head
     n = head.body.model.n_shape
     assert np.array_equal(head.betas.numpy(), subject.params.shape[:n])
-    assert np.allclose(head.poses["jaw"].numpy(), subject.params.jaw_pose)
+    assert np.allclose(head.poses["jaw_pose"].numpy(), subject.params.jaw_pose)
     assert torch.equal(head.canonical(), head.body.shaped(head.betas))
 
 

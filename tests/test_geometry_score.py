@@ -204,7 +204,7 @@ def test_crossings_of_the_head_model_are_not_the_fits(tmp_path: Path, monkeypatc
 def test_evaluate_scores_the_geometry_in_the_poses_of_the_images(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
     """``metrics.json`` has the keys that it promises, from training timesteps as refined."""
     avatar, subject = pair
-    avatar.head.poses["jaw"] += 0.3
+    avatar.head.poses["jaw_pose"] += 0.3
     known = _with_truth(avatar, subject, tmp_path / "truth.npz", out=0.0)
     geometry = evaluate(avatar, known, avatar_path=Path("a.pt"), splits=("val",))["geometry"]
     assert geometry == _score(avatar, known)

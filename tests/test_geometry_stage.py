@@ -67,9 +67,8 @@ def test_where_identity_starts(subject, tracked):
 def test_poses_start_as_tracked(subject):
     """Every parameter of every timestep."""
     head = make_stage(subject, tiny_config()).gaussians.head
-    tracked = {"neck": "neck_pose", "jaw": "jaw_pose", "eyes": "eyes_pose"}
     for name, value in head.poses.items():
-        assert np.array_equal(value.detach().numpy(), getattr(subject.params, tracked.get(name, name)))
+        assert np.array_equal(value.detach().numpy(), getattr(subject.params, name))
 
 
 def test_the_triplane_is_read_bilinearly():
@@ -114,7 +113,7 @@ def test_offsets_add_up_before_posing(subject):
     assert torch.allclose(head.canonical(), canonical, atol=1e-8)
     verts = head.body.posed(canonical + posed.pose_offsets, pose, joints=head.body.joints(canonical))
     assert torch.allclose(posed.verts, verts, atol=1e-8)
-    neck = replace(pose, neck=pose.neck + 0.3)
+    neck = replace(pose, neck_pose=pose.neck_pose + 0.3)
     assert torch.equal(head.posed(neck).identity_offsets, posed.identity_offsets)
     assert not torch.allclose(head.posed(neck).pose_offsets, posed.pose_offsets)
     root = replace(pose, rotation=pose.rotation + 0.3, translation=pose.translation + 1.0)
@@ -383,7 +382,7 @@ def test_a_timestep_that_is_not_trained_stays_as_tracked(subject, views):
 
 def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
     """Each group its own rate, and all of them the stated share of it at the end."""
-    config = tiny_config(geometry={"iterations": 10, "final_lr": 0.25})
+    config = tiny_config(geometry={"iterations": 10, "lr_final_factor": 0.25})
     stage = make_stage(subject, config)
     g = config.geometry
     start = [g.lr_refine, g.lr_triplane, g.lr_shape, g.lr_expr, g.lr_pose, g.lr_translation, g.lr_scale, g.lr_color]

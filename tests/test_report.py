@@ -61,7 +61,7 @@ def test_the_page_is_whole_and_self_contained(pair: tuple[Avatar, Subject], tmp_
     assert all(source.startswith("data:image/") for source in re.findall(r'(?:src|href)="([^"]*)', text))
     assert text.count("<svg") == 2
     assert f"{metrics['splits']['val']['psnr']:.2f} dB" in text
-    assert f"{metrics['splits']['test']['trivial']['nearest_frame']:.2f}" in text
+    assert f"{metrics['splits']['test']['naive']['nearest_frame']:.2f}" in text
     assert "geometry.hidden" in text
     names = {path.name for path in (tmp_path / "run" / "pictures").iterdir()}
     assert {"val_0.png", "val_1.png", "test_0.png", "mesh.png", "driven.png"} <= names

@@ -19,7 +19,7 @@ from torch import Tensor
 from mgavatar.camera import Camera, look_at
 from mgavatar.config import ImageLossConfig, RasterConfig
 from mgavatar.gaussians import Gaussians, draw
-from mgavatar.geometry.vertex_gaussians import behind
+from mgavatar.geometry.vertex_gaussians import silhouette_offset
 from mgavatar.losses import image_loss
 
 RADIUS = 0.1
@@ -96,7 +96,7 @@ def calibrate(sigma: float, edge_px: float, surface: Surface, shift: float, *, i
     for iteration in range(iterations):
         view = iteration * 5 % N_CAMERAS  # 5 and 12 have no common factor: every camera, neighbours apart
         verts = radius * directions
-        back = shift * behind(scales[:, 0], verts.detach(), directions, views[view])
+        back = shift * silhouette_offset(scales[:, 0], verts.detach(), directions, views[view])
         gaussians = Gaussians(verts - back[:, None] * directions, quats, scales, opacities, colors)
         image = draw(gaussians, views[view], background=background, config=RasterConfig()).image
         optimizer.zero_grad()

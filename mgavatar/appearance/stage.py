@@ -62,19 +62,22 @@ class AppearanceStage:
             appearance.frozen.head.learn_poses()
             groups += [
                 {"params": [self.poses["expr"]], "lr": tuning.lr_expr},
-                {"params": [self.poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": tuning.lr_pose},
+                {
+                    "params": [self.poses[name] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")],
+                    "lr": tuning.lr_pose,
+                },
                 {"params": [self.poses["translation"]], "lr": tuning.lr_translation},
             ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self.decay = a.final_lr ** (1.0 / max(1, a.iterations))
+        self.decay = a.lr_final_factor ** (1.0 / max(1, a.iterations))
         self.density = DensityControl(g, a.density, extent=appearance.frozen.extent, seed=seed)
 
     def step(
-        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
     ) -> dict[str, float]:
         """Eq. 11 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
 
-        The schedule moves on by ``advance`` configured iterations: another number than 1 makes it shorter or longer.
+        The schedule moves on by ``schedule_step`` configured iterations: another number than 1 makes it shorter or longer.
         """
         a, appearance = self.config.appearance, self.appearance
         gaussians, maps = appearance(self._posed(timestep), camera)
@@ -91,9 +94,9 @@ class AppearanceStage:
         if appearance.color_net is not None:
             appearance.color_net.grid.adam_step(a.color_net.lr * self.decay**self.position)
         for group in self.optimizer.param_groups:
-            group["lr"] *= self.decay**advance
+            group["lr"] *= self.decay**schedule_step
         before = self.position
-        self.position += advance
+        self.position += schedule_step
         self._control_density(screen_grads, rendering, before)
         terms = torch.stack([loss, image_term, binding_term, offset_term]).detach().tolist()
         return dict(zip(("loss", "image", "binding", "offset"), terms, strict=True)) | {"gaussians": len(g)}

@@ -67,7 +67,7 @@ def render_driving(
 
 def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:
     """A line if the driven head leaves the picture."""
-    names = ("rotation", "neck", "translation")
+    names = ("rotation", "neck_pose", "translation")
     places = head_points(avatar, *(np.stack([getattr(pose, name).numpy() for pose in poses]) for name in names))
     outside = sum(not _sees(camera, place) for camera, place in zip(cameras, places, strict=True))
     if not outside:

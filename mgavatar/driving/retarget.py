@@ -135,7 +135,7 @@ def poses_of(
             turned = Rotation.from_rotvec(rotation) * Rotation.from_rotvec(neck)
             neck = (own_root.inv() * turned).as_rotvec()
         else:
-            neck = np.broadcast_to(mean.neck.numpy(), neck.shape)
+            neck = np.broadcast_to(mean.neck_pose.numpy(), neck.shape)
         rotation = np.broadcast_to(mean.rotation.numpy(), rotation.shape)
     columns = (expr, rotation, neck, driving.jaw_pose, driving.eyes_pose, translation)
     tensors = [
@@ -157,7 +157,7 @@ def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translat
 
 def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
     """What moves the driven head's mean place to the avatar's own [m], shape [3]."""
-    own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck, mean.translation)))
+    own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck_pose, mean.translation)))
     driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
     return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)
 
@@ -170,9 +170,9 @@ def mean_pose(avatar: Avatar) -> Pose:
     return Pose(
         expr=torch.zeros(n_expr),
         rotation=_mean_rotation(poses["rotation"][rows]),
-        neck=_mean_rotation(poses["neck"][rows]),
-        jaw=torch.zeros(3),
-        eyes=torch.zeros(6),
+        neck_pose=_mean_rotation(poses["neck_pose"][rows]),
+        jaw_pose=torch.zeros(3),
+        eyes_pose=torch.zeros(6),
         translation=torch.from_numpy(poses["translation"][rows].mean(axis=0)),
     )
 

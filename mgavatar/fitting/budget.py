@@ -80,8 +80,8 @@ class Budget:
         """Seconds used so far."""
         return self.spent + self.clock() - self.started
 
-    def pace(self, iterations: int, *, share: float, must_fit: bool) -> Pace:
-        """The pace of a stage that starts now.
+    def pacer(self, iterations: int, *, share: float, must_fit: bool) -> Pacer:
+        """Return the pacer of a stage that starts now.
 
         Args:
             iterations: Of the stage's schedule.
@@ -89,7 +89,7 @@ class Budget:
             must_fit: Refuse the budget if the stage cannot make its least iterations; otherwise make them anyway.
         """
         left = self.seconds * (1.0 - RESERVE) - self.used
-        return Pace(self, iterations, self.clock() + share * left, share if must_fit else None)
+        return Pacer(self, iterations, self.clock() + share * left, share if must_fit else None)
 
 
 def geometry_share(progress: float) -> float:
@@ -98,7 +98,7 @@ def geometry_share(progress: float) -> float:
     return rest / (rest + 1.0 - GEOMETRY_SHARE)
 
 
-class Pace:
+class Pacer:
     """How far each iteration of one stage moves the schedule, so that both it and the time end together."""
 
     def __init__(self, budget: Budget, iterations: int, deadline: float, share: float | None) -> None:
@@ -108,7 +108,7 @@ class Pace:
         self.n = 0
 
     @property
-    def just_known(self) -> bool:
+    def calibrated(self) -> bool:
         """Whether the last iteration was the first whose pace was known."""
         return self.n == _WARM_UP + 1
 
@@ -117,7 +117,7 @@ class Pace:
         """Seconds until the stage is to end."""
         return self.deadline - self.budget.clock()
 
-    def advance(self, position: float) -> float:
+    def schedule_step(self, position: float) -> float:
         """Call it before every iteration, at ``position``: configured iterations by which it moves the schedule.
 
         Raises:
@@ -133,7 +133,7 @@ class Pace:
         if self.n <= _WARM_UP:
             return min(1.0, most)
         each, left = statistics.median(self.seconds), self.deadline - now
-        if self.just_known and self.share is not None:
+        if self.calibrated and self.share is not None:
             self._check(each, left)
         return most if left <= each else min(rest * each / left, most)
 

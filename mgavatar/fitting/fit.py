@@ -99,7 +99,7 @@ def fit(
         metrics.close()
     avatar.save(run.avatar)
     if budget is not None:
-        log.info("budget %s: used %.0f s: %s", duration(budget.seconds), budget.used, summary.told())
+        log.info("budget %s: used %.0f s: %s", duration(budget.seconds), budget.used, summary.describe())
     summary.write(
         run.folder / "summary.json",
         gaussians=avatar.n_gaussians,

@@ -19,7 +19,7 @@ from mgavatar.avatar import Avatar
 from mgavatar.config import FitConfig, to_toml
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
-from mgavatar.fitting.budget import Budget, Pace, duration, geometry_share
+from mgavatar.fitting.budget import Budget, Pacer, duration, geometry_share
 from mgavatar.fitting.run import Run
 from mgavatar.fitting.stage import Stage
 from mgavatar.fitting.summary import Summary
@@ -84,25 +84,25 @@ class Loop:
         order = iter(ViewOrder(len(views.images), self.seed))
         for _ in range(done):
             next(order)
-        pace = self._pace(stage)
+        pacer = self._pacer(stage)
         iteration, total = done, stage.iterations
         started = noted = saved = time.monotonic()
         with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
             while not finished(stage):
                 iteration += 1
-                advance = 1.0 if pace is None else pace.advance(stage.position)
+                schedule_step = 1.0 if pacer is None else pacer.schedule_step(stage.position)
                 view = next(order)
                 background = self._background(iteration) if views.masks is not None else self.background
                 target = views.target(view, self.background, background)
-                terms = stage.step(views.cameras[view], views.timesteps[view], target, background, advance)
+                terms = stage.step(views.cameras[view], views.timesteps[view], target, background, schedule_step)
                 if not np.isfinite(terms["loss"]):
                     raise DataError(
                         f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "
                         "lower the learning rates"
                     )
-                total = iteration + math.ceil((stage.iterations - stage.position) / advance - _CLOSE)
-                if pace is not None and pace.just_known:
-                    self._tell_pace(stage, total, pace)
+                total = iteration + math.ceil((stage.iterations - stage.position) / schedule_step - _CLOSE)
+                if pacer is not None and pacer.calibrated:
+                    self._log_pace(stage, total, pacer)
                 note = f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians"
                 reporter.update(iteration, note, total=total)
                 now = time.monotonic()
@@ -118,17 +118,17 @@ class Loop:
                     avatar.save(self.run.avatar)
                     raise Interrupted(f"stopped in {stage.name} at {iteration}/{total}")
 
-    def _pace(self, stage: Stage) -> Pace | None:
+    def _pacer(self, stage: Stage) -> Pacer | None:
         if self.budget is None:
             return None
         first = stage.name == "geometry" or not self.config.geometry.enabled
         share = geometry_share(stage.position / stage.iterations) if stage.name == "geometry" else 1.0
-        return self.budget.pace(stage.iterations, share=share, must_fit=first and self.fresh)
+        return self.budget.pacer(stage.iterations, share=share, must_fit=first and self.fresh)
 
-    def _tell_pace(self, stage: Stage, total: int, pace: Pace) -> None:
-        """What the budget makes of a stage, once its pace is known."""
+    def _log_pace(self, stage: Stage, total: int, pacer: Pacer) -> None:
+        """What the budget makes of a stage, once its pacer is known."""
         factor = total / stage.iterations
-        text = f"{stage.name} gets {pace.left:.0f} s more, about {total} of {stage.iterations} iterations"
+        text = f"{stage.name} gets {pacer.left:.0f} s more, about {total} of {stage.iterations} iterations"
         if stage.name == "appearance":
             c = self.config.appearance.density
             start, stop, every = (round(factor * value) for value in (c.start, c.stop, c.every))

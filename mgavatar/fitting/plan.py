@@ -18,7 +18,7 @@ from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.head.body import FINE_ENOUGH
 from mgavatar.head.model import HeadModel
-from mgavatar.head.params import fitted
+from mgavatar.head.params import pad_or_truncate
 
 STILL = 0.1
 """A joint that turns by less than this [deg] was not tracked, or was held."""
@@ -64,7 +64,7 @@ class Decision:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class CaptureCoverage:
     """What the training images of a capture can show of the head model.
 
     Attributes:
@@ -139,7 +139,7 @@ class Sight:
     def expression(self) -> float:
         """Largest motion of a vertex by expressions, away from their mean over the training timesteps [m]."""
         head = self.head
-        values = fitted(self.subject.params.expr[self.timesteps], head.n_expr)
+        values = pad_or_truncate(self.subject.params.expr[self.timesteps], head.n_expr)
         dirs = head.shapedirs[:, :, head.n_shape :].reshape(3 * len(head.v_template), head.n_expr)
         mean = values.mean(0)
         return max(float(np.linalg.norm((dirs @ (row - mean)).reshape(-1, 3), axis=1).max()) for row in values)
@@ -165,12 +165,12 @@ def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[FitConfi
     Returns:
         The configuration without any ``auto``, and the decisions that change what the fit does.
     """
-    sight = Sight(head, subject, config.appearance.max_image_size)
+    coverage = CaptureCoverage(head, subject, config.appearance.max_image_size)
     decisions = []
     for key, rule in RULES.items():
         if _value(config, key) != "auto":
             continue
-        value, reason = rule(config, sight)
+        value, reason = rule(config, coverage)
         config = _with(config, key, value)
         if _matters(config, key):
             decisions.append(Decision(key, value, reason))
@@ -179,8 +179,8 @@ def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[FitConfi
     return config, tuple(decisions)
 
 
-def _subdivisions(config: FitConfig, sight: Sight) -> tuple[int, str]:
-    n_verts, pixels = len(sight.head.v_template), sight.edge / sight.pixel
+def _subdivisions(config: FitConfig, coverage: CaptureCoverage) -> tuple[int, str]:
+    n_verts, pixels = len(coverage.head.v_template), coverage.edge / coverage.pixel
     if n_verts >= FINE_ENOUGH:
         return 0, f"no subdivision: the head model has {n_verts} vertices"
     if pixels <= config.geometry.fine_edge:
@@ -188,68 +188,71 @@ def _subdivisions(config: FitConfig, sight: Sight) -> tuple[int, str]:
     return 1, f"one subdivision: edges of {pixels:.1f} px are longer than {config.geometry.fine_edge:g}"
 
 
-def _learn_jaw(config: FitConfig, sight: Sight) -> tuple[bool, str]:
-    turn = sight.turn("jaw_pose")
+def _learn_jaw(config: FitConfig, coverage: CaptureCoverage) -> tuple[bool, str]:
+    turn = coverage.turn("jaw_pose")
     return (True, f"jaw refined: it turns by {turn:.1f} deg") if turn > STILL else (False, "jaw held: it never turns")
 
 
-def _learn_eyes(config: FitConfig, sight: Sight) -> tuple[bool, str]:
-    turn = sight.turn("eyes_pose")
+def _learn_eyes(config: FitConfig, coverage: CaptureCoverage) -> tuple[bool, str]:
+    turn = coverage.turn("eyes_pose")
     return (
         (True, f"eyes refined: they turn by {turn:.1f} deg") if turn > STILL else (False, "eyes held: they are still")
     )
 
 
-def _pose_offsets(config: FitConfig, sight: Sight) -> tuple[bool, str]:
-    turn = max(sight.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
+def _pose_offsets(config: FitConfig, coverage: CaptureCoverage) -> tuple[bool, str]:
+    turn = max(coverage.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
     return (
         turn > SMALL_TURN,
         f"{'' if turn > SMALL_TURN else 'no '}pose offsets: neck, jaw and eyes turn by {turn:.1f} deg",
     )
 
 
-def _offset_net(config: FitConfig, sight: Sight) -> tuple[bool, str]:
-    if len(sight.timesteps) == 1:
+def _offset_net(config: FitConfig, coverage: CaptureCoverage) -> tuple[bool, str]:
+    if len(coverage.timesteps) == 1:
         return False, "no OffsetNet: one timestep"
-    pixels = sight.expression / sight.pixel
-    turn = max(sight.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
+    pixels = coverage.expression / coverage.pixel
+    turn = max(coverage.turn(f"{name}_pose") for name in ("neck", "jaw", "eyes"))
     if pixels <= HALF_PIXEL and turn <= HALF_TURN:
         return False, f"no OffsetNet: expressions move {pixels:.1f} px, neck, jaw and eyes turn by {turn:.1f} deg"
     return True, f"OffsetNet: expressions move {pixels:.1f} px, neck, jaw and eyes turn by {turn:.1f} deg"
 
 
-def _map_size(config: FitConfig, sight: Sight) -> tuple[int, str]:
-    side = math.sqrt(sight.head_pixels)
+def _map_size(config: FitConfig, coverage: CaptureCoverage) -> tuple[int, str]:
+    side = math.sqrt(coverage.head_pixels)
     size = min(MAP_SIZES, key=lambda size: abs(math.log(size / max(side, 1.0))))
     return size, f"UV maps of {size}: an image has {side:.0f} x {side:.0f} pixels on the head"
 
 
-def _colors(config: FitConfig, sight: Sight) -> tuple[str, str]:
-    if sight.spread <= ONE_DIRECTION:
-        return "sh", f"one colour a Gaussian: views differ by {sight.spread:.1f} deg from one direction"
-    return "color_net", f"ColorNet: views differ by up to {sight.spread:.1f} deg from their mean"
+def _colors(config: FitConfig, coverage: CaptureCoverage) -> tuple[str, str]:
+    if coverage.spread <= ONE_DIRECTION:
+        return "sh", f"one colour a Gaussian: views differ by {coverage.spread:.1f} deg from one direction"
+    return "color_net", f"ColorNet: views differ by up to {coverage.spread:.1f} deg from their mean"
 
 
-def _view_frame(config: FitConfig, sight: Sight) -> tuple[str, str]:
-    if sight.spread <= NARROW_VIEWS:
-        return "none", f"colours without view direction: views differ by {sight.spread:.1f} deg at most"
-    return "canonical", f"colours by view direction in the head's frame: views differ by up to {sight.spread:.0f} deg"
+def _view_frame(config: FitConfig, coverage: CaptureCoverage) -> tuple[str, str]:
+    if coverage.spread <= NARROW_VIEWS:
+        return "none", f"colours without view direction: views differ by {coverage.spread:.1f} deg at most"
+    return (
+        "canonical",
+        f"colours by view direction in the head's frame: views differ by up to {coverage.spread:.0f} deg",
+    )
 
 
-def _max_resolution(config: FitConfig, sight: Sight) -> tuple[int, str]:
+def _max_resolution(config: FitConfig, coverage: CaptureCoverage) -> tuple[int, str]:
     base = config.appearance.color_net.base_resolution
-    cells = max(base, min(FINEST, math.ceil(sight.extent / sight.pixel)))
-    return cells, f"hash grid up to {cells} cells: {_mm(sight.extent / cells)}, a pixel {_mm(sight.pixel)}"
+    cells = max(base, min(FINEST, math.ceil(coverage.extent / coverage.pixel)))
+    return cells, f"hash grid up to {cells} cells: {_mm(coverage.extent / cells)}, a pixel {_mm(coverage.pixel)}"
 
 
-def _levels(config: FitConfig, sight: Sight) -> tuple[int, str]:
+def _levels(config: FitConfig, coverage: CaptureCoverage) -> tuple[int, str]:
     grid = config.appearance.color_net
     steps = math.log(float(grid.max_resolution) / grid.base_resolution) / math.log(GROWTH)
     levels = min(LEVELS, 1 + math.ceil(steps - 1e-3))
     return levels, f"{levels} hash levels: {grid.base_resolution} to {grid.max_resolution} cells"
 
 
-RULES: dict[str, Callable[[FitConfig, Sight], tuple[Any, str]]] = {
+RULES: dict[str, Callable[[FitConfig, CaptureCoverage], tuple[Any, str]]] = {
     "geometry.subdivisions": _subdivisions,
     "geometry.learn_jaw": _learn_jaw,
     "geometry.learn_eyes": _learn_eyes,

@@ -17,7 +17,7 @@ class Stage(Protocol):
     position: float
 
     def step(
-        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
     ) -> dict[str, float]: ...
 
     def state_dict(self) -> dict[str, Any]: ...

@@ -42,7 +42,7 @@ class Summary:
             "seconds": round(before + seconds, 3),
         }
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words, for the user."""
         stages = self.stages.items()
         return ", ".join(f"{name} {stage['iterations']} of {stage['configured']} iterations" for name, stage in stages)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mgavatar.config import GeometryConfig
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
-from mgavatar.head.params import HeadParams, Pose, fitted
+from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +39,16 @@ class PersonalHead(nn.Module):
         self.body = body
         device = body.device
         n_expr = body.model.n_expr
-        start = fitted(params.shape, body.model.n_shape) if config.start_from_tracked_shape else 0.0 * params.shape
-        self.betas = nn.Parameter(torch.from_numpy(fitted(np.asarray(start), body.model.n_shape)).to(device))
+        start = (
+            pad_or_truncate(params.shape, body.model.n_shape) if config.start_from_tracked_shape else 0.0 * params.shape
+        )
+        self.betas = nn.Parameter(torch.from_numpy(pad_or_truncate(np.asarray(start), body.model.n_shape)).to(device))
         tracked = {
-            "expr": fitted(params.expr, n_expr),
+            "expr": pad_or_truncate(params.expr, n_expr),
             "rotation": params.rotation,
-            "neck": params.neck_pose,
-            "jaw": params.jaw_pose,
-            "eyes": params.eyes_pose,
+            "neck_pose": params.neck_pose,
+            "jaw_pose": params.jaw_pose,
+            "eyes_pose": params.eyes_pose,
             "translation": params.translation,
         }
         self.poses = nn.ParameterDict(
@@ -70,13 +72,16 @@ class PersonalHead(nn.Module):
     def learn_poses(self) -> None:
         """Let the parameters of all timesteps learn; jaw and eyes where ``learn_jaw`` and ``learn_eyes`` say so."""
         self.poses.requires_grad_(True)
-        self.poses["jaw"].requires_grad_(bool(self.config.learn_jaw))
-        self.poses["eyes"].requires_grad_(bool(self.config.learn_eyes))
+        self.poses["jaw_pose"].requires_grad_(bool(self.config.learn_jaw))
+        self.poses["eyes_pose"].requires_grad_(bool(self.config.learn_eyes))
 
     def pose(self, timestep: int) -> Pose:
         """Parameters of a timestep of the capture, as refined so far."""
         return Pose(
-            *(self.poses[name][timestep] for name in ("expr", "rotation", "neck", "jaw", "eyes", "translation"))
+            *(
+                self.poses[name][timestep]
+                for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
+            )
         )
 
     def shaped(self) -> Tensor:
@@ -89,14 +94,14 @@ class PersonalHead(nn.Module):
         features = self.refine.encode()
         shaped = self.shaped()
         identity = self.refine.identity_offsets(features)
-        by_pose = self.refine.pose_offsets(features, torch.cat([pose.neck, pose.jaw, pose.eyes]))
+        by_pose = self.refine.pose_offsets(features, torch.cat([pose.neck_pose, pose.jaw_pose, pose.eyes_pose]))
         canonical = shaped + identity
         joints = self.joints(canonical)
         return PosedHead(shaped, identity, by_pose, self.body.posed(canonical + by_pose, pose, joints=joints))
 
     def _tracked_shape(self, params: HeadParams) -> Tensor:
         """The tracker's own neutral head [m], with its offsets where it has some."""
-        betas = torch.from_numpy(fitted(params.shape, self.body.model.n_shape)).to(self.body.device)
+        betas = torch.from_numpy(pad_or_truncate(params.shape, self.body.model.n_shape)).to(self.body.device)
         offsets = _base_offsets(params.static_offset, len(self.body.v_template))
         shaped = self.body.shaped(betas)
         return shaped if offsets is None else shaped + self.body.carry(torch.from_numpy(offsets).to(shaped))

@@ -46,20 +46,20 @@ class GeometryStage:
             {"params": [head.refine.planes], "lr": g.lr_triplane},
             {"params": [head.betas], "lr": g.lr_shape},
             {"params": [poses["expr"]], "lr": g.lr_expr},
-            {"params": [poses[name] for name in ("rotation", "neck", "jaw", "eyes")], "lr": g.lr_pose},
+            {"params": [poses[name] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")], "lr": g.lr_pose},
             {"params": [poses["translation"]], "lr": g.lr_translation},
             {"params": [gaussians.log_scales], "lr": g.lr_scale},
             {"params": [gaussians.colors], "lr": g.lr_color},
         ]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self.decay = g.final_lr ** (1.0 / max(1, g.iterations))
+        self.decay = g.lr_final_factor ** (1.0 / max(1, g.iterations))
 
     def step(
-        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, advance: float = 1.0
+        self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
     ) -> dict[str, float]:
         """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
 
-        The schedule moves on by ``advance`` configured iterations: another number than 1 makes it shorter or longer.
+        The schedule moves on by ``schedule_step`` configured iterations: another number than 1 makes it shorter or longer.
         """
         g = self.config.geometry
         head = self.gaussians.head
@@ -74,8 +74,8 @@ class GeometryStage:
         loss.backward()
         self.optimizer.step()
         for group in self.optimizer.param_groups:
-            group["lr"] *= self.decay**advance
-        self.position += advance
+            group["lr"] *= self.decay**schedule_step
+        self.position += schedule_step
         if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn, so no other term would tell
             loss = loss * torch.nan
         terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()

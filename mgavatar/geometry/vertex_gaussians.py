@@ -37,7 +37,7 @@ class VertexGaussians(nn.Module):
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
     def bound(self, posed: PosedHead, camera: Camera, *, scales: Tensor | None = None) -> Gaussians:
-        """The Gaussians on a posed head as a camera sees them: drawn behind the surface by :func:`behind`.
+        """The Gaussians on a posed head as a camera sees them: drawn behind the surface by :func:`silhouette_offset`.
 
         ``scales`` are those of :meth:`scales`, for a caller that has them already.
         """
@@ -46,7 +46,12 @@ class VertexGaussians(nn.Module):
         shift = self.config.geometry.surface_shift
         if shift:
             normals = self.head.body.normals(verts)
-            verts = verts - shift * behind(scales.detach(), verts.detach(), normals.detach(), camera)[:, None] * normals
+            verts = (
+                verts
+                - shift
+                * silhouette_offset(scales.detach(), verts.detach(), normals.detach(), camera)[:, None]
+                * normals
+            )
         n = len(verts)
         quats = torch.zeros(n, 4, device=verts.device)
         quats[:, 0] = 1.0
@@ -60,7 +65,7 @@ class VertexGaussians(nn.Module):
         return draw(gaussians, camera, background=background, config=self.config.raster)
 
 
-def behind(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera) -> Tensor:
+def silhouette_offset(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera) -> Tensor:
     """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
 
     One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of

@@ -44,33 +44,33 @@ class Pose:
     Attributes:
         expr: Shape [E].
         rotation: Shape [3].
-        neck: Shape [3].
-        jaw: Shape [3].
-        eyes: Left, then right, shape [6].
+        neck_pose: Shape [3].
+        jaw_pose: Shape [3].
+        eyes_pose: Left, then right eye, shape [6].
         translation: Metres, shape [3].
     """
 
     expr: Tensor
     rotation: Tensor
-    neck: Tensor
-    jaw: Tensor
-    eyes: Tensor
+    neck_pose: Tensor
+    jaw_pose: Tensor
+    eyes_pose: Tensor
     translation: Tensor
 
     def joint_rotations(self) -> Tensor:
         """Rotation vectors of root, neck, jaw and both eyes, shape [5, 3]."""
-        return torch.cat([self.rotation, self.neck, self.jaw, self.eyes]).reshape(5, 3)
+        return torch.cat([self.rotation, self.neck_pose, self.jaw_pose, self.eyes_pose]).reshape(5, 3)
 
     def centered(self) -> Pose:
         """The same face without root rotation and translation."""
         zero = torch.zeros_like(self.rotation)
-        return Pose(self.expr, zero, self.neck, self.jaw, self.eyes, zero)
+        return Pose(self.expr, zero, self.neck_pose, self.jaw_pose, self.eyes_pose, zero)
 
     def to(self, device: torch.device) -> Pose:
         return Pose(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
-def fitted(values: np.ndarray, n: int) -> np.ndarray:
+def pad_or_truncate(values: np.ndarray, n: int) -> np.ndarray:
     """Coefficients cut or padded with zeros along the last axis to ``n``, float32."""
     out = np.zeros((*values.shape[:-1], n), np.float32)
     width = min(n, values.shape[-1])
@@ -80,5 +80,5 @@ def fitted(values: np.ndarray, n: int) -> np.ndarray:
 
 def pose_of(params: HeadParams, timestep: int, n_expr: int) -> Pose:
     """Row ``timestep`` of tracked parameters, with as many expression coefficients as the head has."""
-    rows = (fitted(params.expr, n_expr), params.rotation, params.neck_pose, params.jaw_pose, params.eyes_pose)
+    rows = (pad_or_truncate(params.expr, n_expr), params.rotation, params.neck_pose, params.jaw_pose, params.eyes_pose)
     return Pose(*(torch.from_numpy(row[timestep].copy()) for row in (*rows, params.translation)))

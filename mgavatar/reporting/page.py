@@ -32,7 +32,7 @@ from mgavatar.scoring.truth import Truth
 
 _LIBRARIES = ("torch", "warp-lang", "numpy", "scipy", "kornia", "Pillow")
 _TITLES: dict[str, str] = {"val": "Novel views (val)", "test": "Self-reenactment (test)", "train": "Training views"}
-_TRIVIAL = {"white": "white", "mean_image": "mean image", "nearest_frame": "nearest frame"}
+_NAIVE = {"white": "white", "mean_image": "mean image", "nearest_frame": "nearest frame"}
 
 _STEPS = {
     "start": "start, as tracked",
@@ -246,13 +246,13 @@ def _duration(seconds: float) -> str:
 def _scores(metrics: dict[str, Any] | None) -> str:
     if metrics is None:
         return '<p class="quiet">Not evaluated.</p>'
-    head = ["", "images", "SSIM", "LPIPS", "PSNR [dB]", *_TRIVIAL.values()]
+    head = ["", "images", "SSIM", "LPIPS", "PSNR [dB]", *_NAIVE.values()]
     rows = []
     for split, score in metrics["splits"].items():
-        trivial = score.get("trivial", {})
+        naive = score.get("naive", {})
         images = f"{score['frames']} of {score['sampled_from']}" if "sampled_from" in score else str(score["frames"])
         values = [_number(score.get("ssim"), 4), _number(score.get("lpips"), 4), _number(score.get("psnr"), 2)]
-        rows.append([_TITLES.get(split, split), images, *values, *(_number(trivial.get(name), 2) for name in _TRIVIAL)])
+        rows.append([_TITLES.get(split, split), images, *values, *(_number(naive.get(name), 2) for name in _NAIVE)])
     notes = (
         '<p class="quiet">The last three columns are the PSNR of predictors that know nothing of heads: a white image, '
         "the mean training image, and the training image nearest in camera and pose. A score means something above "

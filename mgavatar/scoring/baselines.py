@@ -23,7 +23,7 @@ _EXPRESSION = 0.002
 """What one unit of expression typically moves [m]."""
 
 
-class TrivialPredictors:
+class NaiveBaselines:
     """White, the mean training image, and the nearest training image, each scored as an avatar is.
 
     The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distances`. A camera that

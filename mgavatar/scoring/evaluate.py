@@ -19,7 +19,7 @@ from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
 from mgavatar.head.params import HeadParams, Pose, pose_of
 from mgavatar.losses import ssim
-from mgavatar.scoring.baselines import TrivialPredictors
+from mgavatar.scoring.baselines import NaiveBaselines
 from mgavatar.scoring.geometry import score_geometry
 from mgavatar.scoring.image_metrics import psnr
 from mgavatar.scoring.lpips import NO_WEIGHTS, Lpips, load_lpips
@@ -58,9 +58,9 @@ def evaluate(
         progress: Called with the number of images scored and their total.
 
     Returns:
-        ``avatar``, ``data``, ``device``; ``splits`` with ``psnr`` [dB], ``ssim``, ``lpips`` and, under ``trivial``, the
+        ``avatar``, ``data``, ``device``; ``splits`` with ``psnr`` [dB], ``ssim``, ``lpips`` and, under ``naive``, the
         PSNR [dB] of predictors that know nothing of heads; ``geometry`` or None; ``seconds_per_frame``, the median
-        time from pose to image. Splits without images are left out, and so are trivial predictors that have nothing to
+        time from pose to image. Splits without images are left out, and so are naive baselines that have nothing to
         predict with.
 
     Raises:
@@ -180,7 +180,7 @@ class _Scorer:
 
     def __init__(self, avatar: Avatar, subject: Subject, lpips: Lpips | None) -> None:
         self.avatar, self.subject, self.lpips = avatar, subject, lpips
-        self.trivial = TrivialPredictors(subject)
+        self.naive = NaiveBaselines(subject)
         self.seconds: list[float] = []
 
     def score(self, frame: Frame) -> dict[str, float | None]:
@@ -195,14 +195,14 @@ class _Scorer:
             "psnr": psnr(on_cpu, target),
             "ssim": float(ssim(image, on_device)),
             "lpips": None if self.lpips is None else float(self.lpips(image, on_device)),
-            **self.trivial.scores(frame, target),
+            **self.naive.scores(frame, target),
         }
 
 
 def _summary(
     split: Split, frames: Sequence[Frame], scores: list[dict[str, float | None]], *, has_lpips: bool
 ) -> dict[str, Any]:
-    trivial = {name: _mean(scores, name) for name in ("white", "mean_image", "nearest_frame")}
+    naive = {name: _mean(scores, name) for name in ("white", "mean_image", "nearest_frame")}
     return {
         "task": TASKS[split],
         "frames": len(frames),
@@ -212,7 +212,7 @@ def _summary(
         "ssim": _mean(scores, "ssim"),
         "lpips": _mean(scores, "lpips"),
         "lpips_reason": None if has_lpips else NO_WEIGHTS,
-        "trivial": {name: value for name, value in trivial.items() if value is not None},
+        "naive": {name: value for name, value in naive.items() if value is not None},
     }
 
 

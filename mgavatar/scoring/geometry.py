@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
-from mgavatar.head.params import Pose, fitted, pose_of
+from mgavatar.head.params import Pose, pad_or_truncate, pose_of
 from mgavatar.kernels.closest_point import closest_points
 from mgavatar.kernels.self_intersection import crossing_faces
 from mgavatar.scoring.truth import Truth
@@ -120,7 +120,7 @@ def tracked_shape(avatar: Avatar) -> Tensor:
     head = avatar.head
     betas = torch.zeros_like(head.betas)
     if avatar.config.geometry.start_from_tracked_shape:
-        betas += torch.from_numpy(fitted(avatar.capture.tracked.shape, len(betas))).to(betas)
+        betas += torch.from_numpy(pad_or_truncate(avatar.capture.tracked.shape, len(betas))).to(betas)
     return head.body.shaped(betas)
 
 
