@@ -77,7 +77,7 @@ class AppearanceStage:
     ) -> dict[str, float]:
         """Eq. 11 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
 
-        The schedule moves on by ``schedule_step`` configured iterations: another number than 1 makes it shorter or longer.
+        The schedule moves on by ``schedule_step`` configured iterations; a budget makes it shorter or longer than 1.
         """
         a, appearance = self.config.appearance, self.appearance
         gaussians, maps = appearance(self._posed(timestep), camera)

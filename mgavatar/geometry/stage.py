@@ -59,7 +59,7 @@ class GeometryStage:
     ) -> dict[str, float]:
         """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
 
-        The schedule moves on by ``schedule_step`` configured iterations: another number than 1 makes it shorter or longer.
+        The schedule moves on by ``schedule_step`` configured iterations; a budget makes it shorter or longer than 1.
         """
         g = self.config.geometry
         head = self.gaussians.head
