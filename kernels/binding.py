@@ -13,7 +13,9 @@ from torch.autograd.function import once_differentiable
 
 from mgavatar.kernels import face_frames
 from mgavatar.kernels.bridge import launch_ranges
+from mgavatar.kernels.face_frames import gather_matrix
 from mgavatar.kernels.precision import Real, by_dtype, pick
+from mgavatar.kernels.sparse import SparseMatrix
 
 N_OFFSETS = 13
 """Columns of the offsets: position 3, colour 3, rotation vector 3, log-scale 3, opacity logit 1."""
@@ -175,7 +177,7 @@ _KERNELS = by_dtype(_kernels)
 
 class _Bind(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, face_ids: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, order: SparseMatrix | None, face_ids: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         face_quats, face_scales, face_centers, means, quats, log_scales, logits, offsets = tensors
         n = len(face_ids)
         # Exponentials are left to torch, whose are vectors.
@@ -187,6 +189,7 @@ class _Bind(torch.autograd.Function):
             inputs = (face_quats, face_scales, face_centers, face_ids, means, quats, scales, offsets.reshape(-1))
             launch_ranges(_KERNELS[means.dtype].bind, n, inputs, outputs, ranges_per_thread=1)
         ctx.save_for_backward(face_quats, face_scales, face_ids, means, quats, scales, opacities, offsets)
+        ctx.order = order
         return *outputs[:3], opacities, outputs[3]
 
     @staticmethod
@@ -196,19 +199,26 @@ class _Bind(torch.autograd.Function):
         n = len(face_ids)
         v_local = [torch.empty_like(tensor, memory_format=torch.contiguous_format) for tensor in local]
         v_offsets = offsets.new_empty(offsets.shape)
-        wants_frames = any(ctx.needs_input_grad[1:4])
+        wants_frames = any(ctx.needs_input_grad[2:5])
         shares = offsets.new_empty(n if wants_frames else 0, 8)
         if n:
             outputs = (*v_local, v_offsets.view(-1), shares)
             inputs = (*ctx.saved_tensors[:-1], offsets.reshape(-1), *v_outputs)
             launch_ranges(_KERNELS[offsets.dtype].bind_bwd, n, inputs, outputs, ranges_per_thread=1)
-        v_frames = _by_face(shares, face_ids, len(face_scales)) if wants_frames else (None, None, None)
-        return None, *v_frames, *v_local, v_offsets
+        v_frames: tuple[Tensor | None, ...] = (None, None, None)
+        if wants_frames:
+            order = gather_matrix(face_ids, len(face_scales)) if ctx.order is None else ctx.order
+            v_frames = _by_face(shares, order)
+        return None, None, *v_frames, *v_local, v_offsets
 
 
-def _by_face(shares: Tensor, face_ids: Tensor, n_faces: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Sums of the Gaussians' shares of their faces' quaternions, scales and centres, in a fixed order."""
-    sums = shares.new_zeros(n_faces, 8).index_put_((face_ids,), shares, accumulate=True)
+def _by_face(shares: Tensor, order: SparseMatrix) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum the Gaussians' shares of their faces' quaternions, scales and centres.
+
+    Reading a face's row is a gather, so its adjoint is the transposed gather: each face adds up its own Gaussians in
+    ascending order. ``index_put_(accumulate=True)`` would add with atomics and give other bits from run to run.
+    """
+    sums = order.T.multiply(shares)
     return sums[:, :4].contiguous(), sums[:, 4].contiguous(), sums[:, 5:].contiguous()
 
 
@@ -221,6 +231,7 @@ def bind_to_faces(
     opacity_logits: Tensor,
     *,
     offsets: Tensor | None = None,
+    order: SparseMatrix | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Carry Gaussians with their offsets from their faces to the world (Eq. 8 to 10). Differentiable in all floats.
 
@@ -234,7 +245,9 @@ def bind_to_faces(
         local_quats: Rotations wxyz in the face's frame, shape [N, 4]; their length is carried through.
         log_scales: Logarithms of standard deviations in units of k, shape [N, 3].
         opacity_logits: Shape [N].
-        offsets: What is added, columns as :data:`N_OFFSETS` says, shape [N, 13]; nothing by default.
+        offsets: Added to the local parameters, columns as in :data:`N_OFFSETS`, shape [N, 13]; nothing by default.
+        order: :func:`~mgavatar.kernels.face_frames.gather_matrix` of ``face_ids``, read only by the gradient of
+            ``frames``; without it, that gradient prepares it on every call.
 
     Returns:
         Centres [m] [N, 3], rotations wxyz [N, 4], standard deviations [m] [N, 3], opacities [N], and the offsets'
@@ -254,8 +267,10 @@ def bind_to_faces(
     for (name, tensor), shape in zip(tensors.items(), shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} has shape {tuple(tensor.shape)}; {shape} is needed for {n} Gaussians")
+    if order is not None and order.shape != (n, n_faces):
+        raise ValueError(f"order has shape {order.shape}; {(n, n_faces)} is needed for {n} Gaussians")
     pick(_KERNELS, **tensors)
-    return _Bind.apply(face_ids, *tensors.values())
+    return _Bind.apply(order, face_ids, *tensors.values())
 
 
 def place_on_faces(frames: tuple[Tensor, Tensor, Tensor], face_ids: Tensor, local_means: Tensor) -> Tensor:

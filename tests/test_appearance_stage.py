@@ -465,3 +465,20 @@ def test_a_stage_goes_on_from_its_state(subject, views, steps):
     assert steps[0] == steps[1]
     for (name, a), b in zip(stage.appearance.named_parameters(), other.appearance.parameters(), strict=True):
         assert torch.equal(a, b), name
+
+
+def test_a_loaded_state_of_the_same_size_replaces_what_was_prepared(subject, views):
+    """Other faces and texture coordinates, as many Gaussians: the next view uses them."""
+    appearance = make_appearance(subject)
+    torch.nn.init.normal_(appearance.offset_net.last.weight)
+    posed = appearance.frozen.at_timestep(0)
+    appearance(posed, views.cameras[0])
+    state = copy.deepcopy(appearance.state_dict())
+    state["gaussians.face_ids"] = state["gaussians.face_ids"].flip(0)
+    state["gaussians.uvs"] = state["gaussians.uvs"].flip(0)
+    appearance.load_state_dict(state)
+    fresh = make_appearance(subject)
+    fresh.load_state_dict(state)
+    found, expected = (model(posed, views.cameras[0])[0] for model in (appearance, fresh))
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))

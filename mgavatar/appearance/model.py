@@ -18,6 +18,7 @@ from mgavatar.gaussians import Gaussians
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.params import Pose
 from mgavatar.kernels.binding import bind_to_faces, directions_on_faces
+from mgavatar.kernels.face_frames import gather_matrix
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
 
@@ -112,21 +113,32 @@ class Appearance(nn.Module):
         )
         self.view_frame = a.color_net.view_frame if a.colors == "color_net" else a.sh.view_frame
         self.offset_net = OffsetNet(a.offset_net).to(device) if a.offset_net.enabled else None
-        self._sampler: SparseMatrix | None = None
-
+        self._forget()
+        self.register_load_state_dict_post_hook(lambda module, _: module._forget())
         self.rebind()
+
+    def _forget(self) -> None:
+        """Drop what was prepared for the Gaussians' faces and texture coordinates, because they have changed."""
+        self._sampler: SparseMatrix | None = None
+        self._by_face: SparseMatrix | None = None
 
     def rebind(self) -> None:
         """Look up the Gaussians' texture coordinates anew; call it when their number has changed."""
         g, frozen = self.gaussians, self.frozen
         means = g.local_means.detach()
         g.uvs = face_uvs(means, g.face_ids, frozen.frames, frozen.canonical, frozen.body.faces, frozen.face_vt)
-        self._sampler = None
+        self._forget()
 
     def resize(self, n: int) -> None:
         """Make room for ``n`` Gaussians, before a state of that many is loaded."""
         self.gaussians.resize(n)
-        self._sampler = None
+        self._forget()
+
+    def _order(self, posed: PosedMesh) -> SparseMatrix | None:
+        """Gaussians by face, for the gradient of a head that still learns."""
+        if self._by_face is None and posed.frames.quats.requires_grad:
+            self._by_face = gather_matrix(self.gaussians.face_ids, self.gaussians.n_faces)
+        return self._by_face
 
     def _offsets(self, posed: PosedMesh) -> tuple[Tensor, Tensor] | None:
         """``O_map`` [13, H, W], and what each Gaussian reads there [N, 13]."""
@@ -159,6 +171,7 @@ class Appearance(nn.Module):
             g.face_ids,
             *(getattr(g, name) for name in PARAMETERS),
             offsets=offsets[1] if offsets else None,
+            order=self._order(posed),
         )
         directions = self._directions(means, posed, camera)
         if self.color_net is not None:
