@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from tiny import WHITE, run, tiny_config, tiny_personal_head
+from tiny import run, tiny_config, tiny_personal_head
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
