@@ -322,47 +322,33 @@ def _as_json(metrics: dict[str, Any]) -> str:
     return json.dumps(metrics, indent=2)
 
 
-def bench(
-    what: Annotated[Literal["kernels", "trade", "fit"], tyro.conf.Positional],
+def bench_kernels(
     *,
     threads: int | None = None,
     json: Path | None = None,
     device: Device = "cpu",
     avatar: Path | None = None,
-    data: Path | None = None,
-    out: Path = Path("trade"),
-    views: int = 4,
 ) -> None:
-    """Measure this machine: ``kernels`` against their floor, what shortcuts ``trade``, parts of a step of a ``fit``.
+    """Time every kernel against its plain form and against this machine's lower bound.
 
     Args:
-        what: What to measure.
         threads: CPU threads of the kernels, all cores by default.
-        json: kernels, fit: also write the rows here.
-        device: kernels, fit: where to compute; trade runs on a CPU.
-        avatar: avatar.pt, or the folder of its fit; kernels times it beside the made-up scenes.
-        data: trade: the capture that it was fitted to.
-        out: trade: folder for trade.json, trade.md and trade.png.
-        views: trade: number of training views to measure on.
+        json: Also write the rows to this file.
+        device: Where to compute.
+        avatar: avatar.pt, or the folder of its fit, to time beside the synthetic scenes.
     """
-    if what == "trade":
-        from mgavatar.benchmarks.trade import bench_trade
-
-        if avatar is None or data is None:
-            raise DataError("bench trade: give --avatar and --data, the avatar and the capture that it was fitted to")
-        if views < 1 or (threads is not None and threads < 1):
-            raise DataError("bench trade: --views and --threads must be at least 1")
-        print(bench_trade(_avatar_path(avatar), data, out=out, views=views, threads=threads))
-        return
-    if what == "fit":
-        from mgavatar.benchmarks.fit import bench_fit
-
-        print(bench_fit(threads=threads, json_path=json, device=_device(device).type))
-        return
-    from mgavatar.benchmarks.kernels import bench_kernels
+    from mgavatar.benchmarks.kernels import bench_kernels as run_benchmark
 
     chosen = _avatar_path(avatar) if avatar else None
-    print(bench_kernels(threads=threads, json_path=json, device=_device(device).type, avatar=chosen))
+    print(run_benchmark(threads=threads, json_path=json, device=_device(device).type, avatar=chosen))
+
+
+# Each benchmark is a sub-command with flags of its own. tyro runs it while it builds the argument of `bench`.
+Kernels = Annotated[None, tyro.conf.subcommand(name="kernels", prefix_name=False, constructor=bench_kernels)]
+
+
+def bench(benchmark: Annotated[Kernels | Annotated[None, tyro.conf.Suppress], tyro.conf.arg(name="")]) -> None:
+    """Benchmark this machine."""
 
 
 _COMMANDS: dict[str, Callable[..., None]] = {

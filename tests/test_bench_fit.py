@@ -1,4 +1,4 @@
-"""``bench fit``: parts are timed where they run, in both directions, and add up; the table holds them."""
+"""``tools/bench_fit.py``: parts are timed where they run, in both directions, and add up; the table holds them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import sys
 import time
 from dataclasses import replace
 
+import bench_fit
 import pytest
 import torch
+from step_profile import APPEARANCE, GEOMETRY, REST, Profile
+from step_work import sizes
 
-from mgavatar.benchmarks import fit as bench_fit
-from mgavatar.benchmarks.fit_parts import APPEARANCE, GEOMETRY, REST, Profile
-from mgavatar.benchmarks.fit_work import sizes
+from mgavatar.errors import DataError
 
 CPU = torch.device("cpu")
 PAUSE = 0.02
@@ -75,13 +76,20 @@ def test_both_stages_in_parts(monkeypatch, tmp_path):
     """A small size, from the command's own function to its table and JSON."""
     quick = replace(next(iter(sizes())), image=(48, 40), gaussians=11_000)
     monkeypatch.setattr(bench_fit, "sizes", lambda: [quick])
-    monkeypatch.setattr("mgavatar.benchmarks.fit_work.WARM_UP", 1)
-    text = bench_fit.bench_fit(threads=1, json_path=tmp_path / "fit.json", names=("quick",), steps=2)
+    monkeypatch.setattr("step_work.WARM_UP", 1)
+    text = bench_fit.bench_fit(threads=1, json=tmp_path / "fit.json", names=("quick",), steps=2)
     geometry, appearance = json.loads((tmp_path / "fit.json").read_text())["rows"]
     for row, parts in ((geometry, GEOMETRY), (appearance, APPEARANCE)):
         assert set(row["parts_ms"]) == {name for *_, name in parts} | {REST}
         assert all(value > 0 for value in row["parts_ms"].values())
         assert sum(row["parts_ms"].values()) < 3 * row["step_ms"]
-        assert all(f"| {name} |" in text for name in row["parts_ms"])
+        assert all(f"| {name} " in text for name in row["parts_ms"])
     assert appearance["work"] == "48 x 40, 11K Gaussians"
     assert appearance["refine_ms"] > 0
+
+
+@pytest.mark.parametrize("flag", ["threads", "steps"])
+def test_a_number_that_cannot_be_is_refused(flag):
+    """Before a capture is made; the message names the flag."""
+    with pytest.raises(DataError, match=f"--{flag} 0: must be at least 1"):
+        bench_fit.bench_fit(**{flag: 0})

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from itertools import islice
+from pathlib import Path
 
 import pytest
 import torch
 from tiny_avatar import tiny_avatar
 
+from mgavatar import cli
 from mgavatar.benchmarks import kernels as bench
 from mgavatar.benchmarks import kernels_work
 from mgavatar.driving.retarget import mean_pose
@@ -106,6 +108,38 @@ def test_table_and_json(monkeypatch, tmp_path):
 
 
 def test_no_threads_are_refused():
-    """As the kernels themselves refuse them."""
-    with pytest.raises(ValueError, match="at least 1"):
+    """The message names the flag."""
+    with pytest.raises(DataError, match="--threads 0: must be at least 1"):
         bench.bench_kernels(threads=0)
+
+
+@pytest.mark.parametrize("path", ["nowhere/bench.json", "."])
+def test_a_report_that_cannot_be_written_is_refused_before_the_measurement(monkeypatch, tmp_path, path):
+    """A missing folder and a folder in place of a file."""
+    monkeypatch.setattr(bench, "calibrate", lambda device: pytest.fail("measured before the check"))
+    with pytest.raises(DataError, match="folder"):
+        bench.bench_kernels(threads=1, json_path=tmp_path / path)
+
+
+def test_flags_of_the_command_arrive(monkeypatch, capsys, tmp_path):
+    """``mgavatar bench kernels`` has flags of its own; the folder of a fit stands for its avatar."""
+    given = {}
+    monkeypatch.setattr(bench, "bench_kernels", lambda **options: given.update(options) or "the table")
+    flags = ["--threads", "2", "--json", "rows.json", "--device", "cpu", "--avatar", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["mgavatar", "bench", "kernels", *flags])
+    cli.main()
+    assert capsys.readouterr().out == "the table\n"
+    avatar = tmp_path / "avatar.pt"
+    assert given == {"threads": 2, "json_path": Path("rows.json"), "device": "cpu", "avatar": avatar}
+
+
+@pytest.mark.parametrize(
+    ("argv", "word"), [([], "kernels"), (["nothing"], "nothing"), (["kernels", "--views", "2"], "--views")]
+)
+def test_a_wrong_benchmark_or_flag_is_a_wrong_command_line(monkeypatch, capsys, argv, word):
+    """Exit code 2, and the message says what there is."""
+    monkeypatch.setattr("sys.argv", ["mgavatar", "bench", *argv])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert word in capsys.readouterr().err

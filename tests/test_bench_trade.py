@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import bench_trade as trade
+import command_line
 import pytest
 import torch
+import trade_objective as objective
+import trade_raster as raster
 from PIL import Image
 from tiny_avatar import tiny_avatar
+from trade_chart import table
 
-from mgavatar import cli
-from mgavatar.benchmarks import trade
-from mgavatar.benchmarks import trade_parts as parts
-from mgavatar.benchmarks import trade_work as work
-from mgavatar.benchmarks.trade_chart import table
 from mgavatar.config import ACCURACY, RasterConfig
-from mgavatar.errors import DataError
 from mgavatar.gaussians import Gaussians, draw
 from mgavatar.losses import ssim
 
@@ -43,7 +42,13 @@ def run(tmp_path_factory):
     avatar, _ = tiny_avatar(root, size=(24, 32))
     avatar.save(root / "avatar.pt")
     text = trade.bench_trade(
-        root / "avatar.pt", root / "capture", out=root / "out", views=2, rounds=1, regression_steps=4, threads=1
+        avatar=root,
+        data=root / "capture",
+        out=root / "out",
+        views=2,
+        rounds=1,
+        regression_steps=4,
+        threads=1,
     )
     report = json.loads((root / "out" / "trade.json").read_text())
     return {(row["knob"], row["value"]): row for row in report["rows"]}, report, text, root / "out"
@@ -53,7 +58,7 @@ def run(tmp_path_factory):
 def reference(tmp_path_factory):
     """Exact steps of two small views."""
     avatar, subject = tiny_avatar(tmp_path_factory.mktemp("views"), size=(24, 32))
-    return work.Reference(work.scenes_of(avatar, subject, views=2, max_image_size=600))
+    return raster.Reference(raster.scenes_of(avatar, subject, views=2, max_image_size=600))
 
 
 def test_no_knob_and_no_value_is_missing(run):
@@ -75,15 +80,15 @@ def test_every_row_is_filled(run):
         elif knob.startswith("hash"):
             assert 0 < row["psnr"] < 100
         else:
-            assert set(row["gradient"]) == set(work.GRADIENTS)
+            assert set(row["gradient"]) == set(raster.GRADIENTS)
             assert row["psnr"] > 20
             assert row["worst"] < 1
 
 
 def test_the_exact_setting_is_exact(reference):
     """Against itself there is no error at all; below its threshold there is nothing left."""
-    same = work._score([reference.step(0, 0.3)], [work.run_step(reference.scenes[0], work.EXACT)])
-    assert same.psnr == work.PSNR_LIMIT
+    same = raster._score([reference.step(0, 0.3)], [raster.run_step(reference.scenes[0], raster.EXACT)])
+    assert same.psnr == raster.PSNR_LIMIT
     assert same.worst == 0
     assert set(same.gradient.values()) == {0}
     assert reference.remainder() < 1e-9
@@ -104,7 +109,7 @@ def test_levels_are_ordered_and_are_their_thresholds(run):
     """Each level leaves out what the configuration says, and more than the one before it."""
     values = [run[0]["raster.accuracy", name] for name in ACCURACY]
     assert [r["psnr"] for r in values] == sorted((r["psnr"] for r in values), reverse=True)
-    settings = {s.value: s.timed for s in work.raster_knobs()[0]}
+    settings = {s.value: s.timed for s in raster.raster_knobs()[0]}
     assert {name: (s.alpha_threshold, s.stop) for name, s in settings.items()} == ACCURACY
 
 
@@ -112,10 +117,10 @@ def test_drawing_follows_the_level(reference):
     """What the table calls a level is what an avatar with that configuration is drawn with."""
     scene = reference.scenes[0]
     gaussians = Gaussians(*scene.gaussians)
-    for setting in work.raster_knobs()[0]:
+    for setting in raster.raster_knobs()[0]:
         config = RasterConfig(accuracy=setting.value)
         image = draw(gaussians, scene.camera, background=scene.background, config=config).image
-        assert torch.equal(image, work.run_step(scene, setting.timed, setting).image)
+        assert torch.equal(image, raster.run_step(scene, setting.timed, setting).image)
 
 
 def test_what_is_emulated_has_an_effect(run):
@@ -132,26 +137,26 @@ def test_what_is_emulated_has_an_effect(run):
 def test_both_exponentials_agree(reference):
     """The C library's and the polynomial differ by rounding; they are two builds, not one."""
     scene = reference.scenes[0]
-    settings = [replace(work.NEARLY_EXACT, exp=name) for name in ("polynomial", "exact")]
-    images = [work.run_step(scene, s, work._changed("exp", s.exp, exp=s.exp)).image for s in settings]
+    settings = [replace(raster.NEARLY_EXACT, exp=name) for name in ("polynomial", "exact")]
+    images = [raster.run_step(scene, s, raster._changed("exp", s.exp, exp=s.exp)).image for s in settings]
     assert float((images[0] - images[1]).abs().max()) < 1e-6
     assert not torch.equal(*images)
     with pytest.raises(ValueError, match="exp must be one of polynomial, exact"):
-        work.run_step(scene, replace(work.BALANCED, exp="table"))
+        raster.run_step(scene, replace(raster.BALANCED, exp="table"))
 
 
 def test_the_plain_window_is_the_ssim_of_the_losses(rng):
     """With 11 pixels; with 7 it is another number."""
     a, b = torch.rand(2, 3, 20, 17, generator=rng, dtype=torch.float64)
-    assert float(parts.window_ssim(a, b, 11)) == pytest.approx(float(ssim(a, b)), abs=1e-9)
-    assert abs(float(parts.window_ssim(a, b, 7)) - float(ssim(a, b))) > 1e-6
+    assert float(objective.window_ssim(a, b, 11)) == pytest.approx(float(ssim(a, b)), abs=1e-9)
+    assert abs(float(objective.window_ssim(a, b, 7)) - float(ssim(a, b))) > 1e-6
 
 
 def test_colors_are_those_of_the_capture(reference):
     """A Gaussian in front gets the image's colour at its centre, one behind the head none."""
     scene = reference.scenes[0]
     flat = replace(scene, target=torch.tensor([0.2, 0.4, 0.6])[:, None, None].expand_as(scene.target))
-    colors, seen = parts.seen_colors([flat])
+    colors, seen = objective.seen_colors([flat])
     assert 0 < int(seen.sum()) < len(seen)
     assert torch.allclose(colors[seen], torch.tensor([0.2, 0.4, 0.6]).expand(int(seen.sum()), 3), atol=1e-6)
     depth = scene.gaussians[0] @ torch.tensor(scene.camera.viewmat[2, :3], dtype=torch.float32)
@@ -165,7 +170,7 @@ def test_table_and_picture(run):
     assert (report["views"], report["size"]) == (2, [24, 32])
     assert (folder / "trade.md").read_text() == text + "\n"
     for knob in KNOBS:
-        assert f"| {knob} |" in text
+        assert f"| {knob} " in text
     assert len([line for line in text.splitlines() if line.startswith("| ")]) == len(rows) + 2
     with Image.open(folder / "trade.png") as picture:
         assert min(picture.size) > 1000
@@ -175,11 +180,11 @@ def test_table_and_picture(run):
 
 def test_cells():
     """Small shares as powers, large ones in percent, nothing where nothing applies."""
-    row = work.Row(
+    row = raster.Row(
         knob="a", value="b", ratio=0.91234, psnr=51.23, worst=0.012, gradient={"means": 0.0312, "quats": 1e-5}
     )
-    line = table([row]).splitlines()[-1]
-    assert line == "| a | b |  | 0.91 | 51.2 dB | 1.2e-02 | 3.1 % |  |  |  |  |"
+    cells = [cell.strip() for cell in table([row]).splitlines()[-1].split("|")[1:-1]]
+    assert cells == ["a", "b", "", "0.91", "51.2 dB", "1.2e-02", "3.1 %", "", "", "", ""]
 
 
 @pytest.mark.parametrize(
@@ -187,23 +192,32 @@ def test_cells():
 )
 def test_fractions(value, text):
     """As a person would write them."""
-    assert work.fraction(value) == text
+    assert raster.fraction(value) == text
 
 
-def test_the_command_asks_for_avatar_and_capture(monkeypatch, capsys):
-    """One line that says what to give, before anything is loaded."""
-    monkeypatch.setattr("sys.argv", ["mgavatar", "bench", "trade", "--avatar", "avatar.pt"])
+def run_tool(monkeypatch, *flags):
+    """Call the script's command line; return its exit code."""
+    monkeypatch.setattr("sys.argv", ["tools/bench_trade.py", *map(str, flags)])
     with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert stop.value.code == 1
-    assert capsys.readouterr().err == (
-        "mgavatar: bench trade: give --avatar and --data, the avatar and the capture that it was fitted to\n"
-    )
+        command_line.run(trade.bench_trade)
+    return stop.value.code
 
 
-def test_refusals(tmp_path):
-    """A missing avatar is one line; a number that cannot be is the caller's mistake."""
-    with pytest.raises(DataError, match=r"nothing\.pt"):
-        trade.bench_trade(tmp_path / "nothing.pt", tmp_path, out=tmp_path)
-    with pytest.raises(ValueError, match="views must be at least 1"):
-        trade.bench_trade(tmp_path / "nothing.pt", tmp_path, out=tmp_path, views=0)
+def test_a_wrong_command_line_is_said_in_one_line(monkeypatch, capsys, tmp_path):
+    """A number out of range, a folder that cannot be made and a missing avatar: exit code 1, before any work."""
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    flags = ("--avatar", tmp_path / "nothing.pt", "--data", tmp_path)
+    for more, words in (
+        (("--views", 0), "bench_trade.py: --views 0: must be at least 1\n"),
+        (("--out", blocked / "out"), f"bench_trade.py: --out {blocked / 'out'}: cannot be made: Not a directory\n"),
+        (("--out", tmp_path / "out"), "nothing.pt: no such file\n"),
+    ):
+        assert run_tool(monkeypatch, *flags, *more) == 1
+        assert capsys.readouterr().err.endswith(words)
+
+
+def test_a_missing_flag_is_a_wrong_command_line(monkeypatch, capsys, tmp_path):
+    """Exit code 2, and the message names the flag."""
+    assert run_tool(monkeypatch, "--avatar", tmp_path) == 2
+    assert "--data" in capsys.readouterr().err

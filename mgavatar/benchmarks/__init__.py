@@ -1,1 +1,1 @@
-"""``mgavatar bench``: what the kernels, the stages and the accuracy cost on this machine."""
+"""Benchmarks that users run: kernel times on their machine."""

@@ -1,12 +1,11 @@
-"""``mgavatar bench kernels``: how fast the kernels are on this machine, next to plain forms and the machine's limits.
+"""``mgavatar bench kernels``: time the kernels beside their plain forms and the lower bound of this machine.
 
-Machines differ and drift, so everything is timed in one run and what counts are the ratios: to the plain form, and to
-the floor, the time that the machine would need for the arithmetic or the bytes alone.
+Machines differ and drift, so everything is timed in one run. What counts are the ratios: to the plain form, and to the
+floor, the time that the machine would need for the arithmetic or the bytes alone.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -26,8 +25,11 @@ from mgavatar.benchmarks.machine import (
     now,
     thread_limit,
 )
+from mgavatar.benchmarks.report import check_report_path, write_report
+from mgavatar.errors import DataError
 from mgavatar.kernels import bridge
 from mgavatar.kernels.rasterize import RasterSettings
+from mgavatar.reporting.markdown import markdown_table
 
 ROUNDS, REPEATS = 3, 3
 """Each round times the kernel a few times and its plain form once, so that a slow moment meets both."""
@@ -55,7 +57,7 @@ class Row:
 
 
 def _time(step: Step, repeats: int, device: torch.device) -> list[tuple[float, float]]:
-    """Seconds of the forward and the backward pass."""
+    """Return the seconds of each forward and backward pass."""
     times = []
     for _ in range(repeats):
         start = now(device)
@@ -89,7 +91,7 @@ def _row(job: Job, machine: Machine, threads: int, device: torch.device) -> Row:
 
 
 def _exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
-    """Slope of log time over log size, least squares."""
+    """Fit the slope of log time over log size by least squares."""
     x = [math.log(s) for s in sizes]
     y = [math.log(s) for s in seconds]
     mean_x, mean_y = sum(x) / len(x), sum(y) / len(y)
@@ -98,7 +100,7 @@ def _exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
 
 
 def _exponents(device: torch.device) -> dict[str, float]:
-    """How the rasterizer's time grows with Gaussians, pixels and views."""
+    """Fit the exponents with which the rasterizer's time grows with Gaussians, pixels and views."""
 
     def seconds(n: int, side: int, views: int = 1) -> float:
         scene = head_scene(n, (side, side), device)
@@ -118,10 +120,9 @@ def _exponents(device: torch.device) -> dict[str, float]:
 
 
 def _table(rows: Sequence[Row]) -> str:
-    head = ("kernel", "work", "threads", "forward", "backward", "spread", "x floor", "plain / it")
-    lines = [head]
-    lines += [
-        (
+    header = ["kernel", "work", "threads", "forward", "backward", "spread", "x floor", "plain / it"]
+    cells = [
+        [
             row.name,
             row.work,
             str(row.threads),
@@ -130,17 +131,14 @@ def _table(rows: Sequence[Row]) -> str:
             f"{100 * row.spread:.0f} %",
             f"{row.total_ms / row.floor_ms:.1f}",
             f"{row.plain_ms / row.total_ms:.1f}",
-        )
+        ]
         for row in rows
     ]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-    )
+    return markdown_table(header, cells)
 
 
 def _blending_share(n: int, size: tuple[int, int], device: torch.device) -> float:
-    """Blending's part of the rasterizer's time, each pair of runs side by side."""
+    """Measure the share of blending in the rasterizer's time; the two forms take turns."""
     whole, part = raster_job("", n, size, device).step, blending_step(n, size, device)
     shares = []
     for _ in range(2 + ROUNDS * REPEATS):
@@ -156,19 +154,21 @@ def bench_kernels(
 
     Args:
         threads: CPU threads for kernels and torch; all of the machine's by default.
-        json_path: Where to write the rows as JSON.
+        json_path: File to write the rows to as JSON.
         device: ``cpu`` or ``cuda``.
-        avatar: A fitted avatar, ``avatar.pt``, to be timed as well.
+        avatar: File of a fitted avatar to time beside the synthetic scenes.
 
     Returns:
-        A table for people.
+        A Markdown table between a line about the machine and notes.
 
     Raises:
-        DataError: If ``avatar`` cannot be read.
-        ValueError: If ``threads`` is not positive.
+        DataError: If ``threads`` is not positive, ``avatar`` cannot be read, or ``json_path`` cannot be written.
     """
     where = torch.device(device)
     n = bridge.num_threads() if threads is None else threads
+    if n < 1:
+        raise DataError(f"--threads {n}: must be at least 1")
+    check_report_path(json_path)
     rows: list[Row] = []
     with thread_limit(n):
         machine = calibrate(where)
@@ -186,7 +186,7 @@ def bench_kernels(
             "blending_share": share,
             "rows": [asdict(row) for row in rows],
         }
-        json_path.write_text(json.dumps(report, indent=2) + "\n")
+        write_report(json_path, report)
     growth = ", ".join(f"{what} {exponent:.2f}" for what, exponent in exponents.items())
     speed = f"{machine.operations / 1e9:.0f} G multiply-adds/s, {machine.bytes / 1e9:.1f} GB/s"
     notes = [f"blending is {100 * share:.0f} % of rasterize at 20K, 512 x 512", f"exponents of its time: {growth}"]

@@ -11,10 +11,10 @@ from statistics import median
 import torch
 from torch import Tensor
 from torch.nn import functional
+from trade_raster import BALANCED, Row, Scene, psnr
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.avatar import Avatar
-from mgavatar.benchmarks.trade_work import BALANCED, Row, Scene, psnr
 from mgavatar.config import ColorNetConfig
 from mgavatar.kernels.rasterize import Rendering, rasterize
 from mgavatar.kernels.ssim import compare_images
