@@ -20,7 +20,7 @@ from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
 from mgavatar.errors import DataError
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
-from mgavatar.head.params import HeadParams, Pose, pose_of
+from mgavatar.head.params import HeadParams, Pose
 
 Payload = dict[str, Any]
 
@@ -67,7 +67,7 @@ def saved(avatar, tmp_path_factory) -> Path:
 
 def poses(avatar: Avatar, subject: Subject) -> list[Pose]:
     """As fitted, and as tracked in a timestep that was held out."""
-    return [avatar.head.pose(0), pose_of(subject.params, len(subject.params) - 1, avatar.head_model.n_expr)]
+    return [avatar.head.pose(0), subject.params.pose(len(subject.params) - 1, n_expr=avatar.head_model.n_expr)]
 
 
 def assert_same_images(a: Avatar, b: Avatar, subject: Subject) -> None:
@@ -178,7 +178,7 @@ def test_saving_is_atomic(avatar, saved, tmp_path, monkeypatch):
 def test_the_mean_camera_is_the_one_in_the_middle():
     """Of the training cameras, the nearest to their mean position."""
     cameras = {i: look_at([x, 0.0, 1.0], [x, 0, 0], focal=10.0, width=8, height=8) for i, x in enumerate([-1, 0.1, 2])}
-    params = HeadParams(*(np.zeros((1, 3), np.float32) for _ in range(7)))
+    params = HeadParams.neutral(n_frames=1, n_expr=3)
     assert CaptureInfo(params, (0,), (0,), cameras, np.ones(3)).mean_camera() is cameras[1]
 
 

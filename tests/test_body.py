@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from mgavatar.head.body import FINE_ENOUGH, Body
 from mgavatar.head.model import HeadModel
-from mgavatar.head.params import HeadParams, Pose, pad_or_truncate, pose_of
+from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
 from mgavatar.head.procedural.build import build_head
 from mgavatar.head.subdivide import subdivide
 
@@ -131,7 +131,7 @@ def test_the_translation_comes_last(model):
 def test_a_centered_pose_keeps_the_face():
     """Without root motion the head stays in place, and neck, jaw, eyes and expression remain."""
     pose = random_pose(ball_head(), seed=2)
-    centered = pose.centered()
+    centered = pose.without_root()
     assert not centered.rotation.any()
     assert not centered.translation.any()
     for name in ("expr", "neck_pose", "jaw_pose", "eyes_pose"):
@@ -189,7 +189,7 @@ def test_the_pose_of_a_timestep():
     names = {"expr": 4, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
     rows = {name: rng.normal(size=(5, width)).astype(np.float32) for name, width in names.items()}
     params = HeadParams(shape=np.zeros(2, np.float32), **rows)
-    pose = pose_of(params, 3, 6)
+    pose = params.pose(3, n_expr=6)
     assert pose.expr.tolist() == pytest.approx([*rows["expr"][3], 0.0, 0.0])
     joints = np.concatenate([rows[name][3] for name in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")])
     assert torch.equal(pose.joint_rotations(), torch.tensor(joints).reshape(5, 3))
@@ -242,3 +242,18 @@ def test_gradients_reach_identity_expression_and_every_joint():
     for name, leaf in {**leaves, "betas": betas}.items():
         assert leaf.grad is not None, name
         assert leaf.grad.abs().min() > 0, name
+
+
+@pytest.mark.parametrize("name", ["rotation", "eyes_pose", "expr", "shape", "static_offset", "translation"])
+def test_parameters_of_a_wrong_shape_or_not_finite_are_refused(name):
+    """FLAME's row has one type, and it checks itself wherever it is made."""
+    good = replace(
+        HeadParams.neutral(n_frames=2, n_expr=3),
+        shape=np.zeros(4, np.float32),
+        static_offset=np.zeros((5, 3), np.float32),
+    )
+    values = getattr(good, name)
+    with pytest.raises(ValueError, match=name):
+        replace(good, **{name: np.full_like(values, np.nan)})
+    with pytest.raises(ValueError, match=name):
+        replace(good, **{name: np.zeros((*values.shape, 2), np.float32)})

@@ -17,12 +17,13 @@ from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
+from mgavatar.head.params import HeadParams
 from mgavatar.head.procedural.build import build_head
 from mgavatar.kernels.portrait import View, portrait
 from mgavatar.kernels.ray_cast import RayMesh
 from mgavatar.synthetic.capture import make_synthetic_capture
 from mgavatar.synthetic.motion import action_columns, perform
-from mgavatar.synthetic.person import Person, Pose, make_person, subdivision, vertex_normals
+from mgavatar.synthetic.person import Person, make_person, subdivision, vertex_normals
 from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
 
 SIZE = (48, 40)
@@ -262,7 +263,7 @@ def test_an_interrupted_capture_leaves_nothing(head: HeadModel, tmp_path: Path) 
 
 def test_the_person_is_not_in_the_model(person: Person, head: HeadModel) -> None:
     """Hair rises by about a centimetre, and the shoulders are clearly wider than the template's bust."""
-    verts, _ = person.posed()
+    verts, _ = person.posed(HeadParams.neutral(n_frames=1, n_expr=head.n_expr), 0)
     thickness = np.linalg.norm(person.hair, axis=1)[person.masks["hair"][: len(person.hair)]]
     assert 0.005 < np.median(thickness) < 0.05
     assert np.ptp(verts[person.masks["shoulders"], 0]) > 1.4 * np.ptp(head.v_template[:, 0])
@@ -281,14 +282,19 @@ def test_cloth_covers_the_bust(person: Person) -> None:
 
 
 def test_rest_pose_is_the_shaped_head_and_a_root_turn_is_rigid(person: Person, head: HeadModel) -> None:
-    rest, _ = person.posed()
+    rest, _ = person.posed(HeadParams.neutral(n_frames=1, n_expr=head.n_expr), 0)
     betas = person.betas
     shaped = head.v_template + head.shapedirs[:, :, : head.n_shape].astype(np.float64) @ betas
     n = len(person.hair)
     np.testing.assert_allclose(rest[:n], person.fine @ shaped + person.hair, atol=1e-9)
     root = (head.J_regressor.astype(np.float64) @ shaped)[0]
-    zero, turn = np.zeros(3), np.array([0.0, np.pi / 2, 0.0])
-    turned, rotations = person.posed(Pose(np.zeros(head.n_expr), turn, zero, zero, np.zeros(6), np.array([0.1, 0, 0])))
+    turn = np.array([0.0, np.pi / 2, 0.0])
+    motion = replace(
+        HeadParams.neutral(n_frames=1, n_expr=head.n_expr),
+        rotation=turn[None],
+        translation=np.array([[0.1, 0.0, 0.0]]),
+    )
+    turned, rotations = person.posed(motion, 0)
     x, y, z = (rest - root).T
     np.testing.assert_allclose(turned, np.column_stack([z, y, -x]) + root + [0.1, 0, 0], atol=1e-6)
     np.testing.assert_allclose(rotations[0], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-6)
@@ -302,11 +308,11 @@ def test_muscles_and_hair_follow_the_neck_by_millimetres(person: Person, head: H
 
 
 def test_motion_is_smooth_and_uses_names(head: HeadModel) -> None:
-    poses = perform(head, 60, np.random.default_rng(0), turn=0.35)
-    neck = np.degrees([pose.neck_pose for pose in poses])
+    motion = perform(head, 60, np.random.default_rng(0), turn=0.35)
+    neck = np.degrees(motion.neck_pose)
     assert 15 < np.abs(neck[:, 1]).max() < 21
     assert np.abs(np.diff(neck, axis=0)).max() < 4
-    assert max(pose.jaw_pose[0] for pose in poses) > 0.1
+    assert motion.jaw_pose[:, 0].max() > 0.1
     columns = action_columns(head)
     assert {"smile", "blink"} <= set(columns)
     assert all("blink" in head.expr_names[i].lower() for i in columns["blink"])

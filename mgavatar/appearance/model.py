@@ -79,7 +79,7 @@ class FrozenHead:
         """The head in any pose, differentiable in it."""
         verts = self.head.posed(pose).verts
         with torch.no_grad():
-            still = self.head.posed(pose.centered()).verts if self._uv is not None else verts
+            still = self.head.posed(pose.without_root()).verts if self._uv is not None else verts
             theta = pose.joint_rotations().reshape(-1)
             pose_map = self._map(still)
         return PosedMesh(verts, FaceFrames.of(verts, self.body.faces), pose_map, theta)

@@ -9,10 +9,7 @@ import numpy as np
 
 from mgavatar.errors import DataError
 from mgavatar.files import float_array, one_line, read_npz
-
-POSE_WIDTHS = {"rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
-
-MOTION_KEYS = ("expr", *POSE_WIDTHS)
+from mgavatar.head.params import MOTION_KEYS, POSE_WIDTHS, HeadParams
 
 TEXT_KEYS = ("expr_basis", "expr_names", "fps")
 
@@ -24,38 +21,25 @@ DEFAULT_FPS = 25.0
 MAX_FRAMES = 1_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Driving:
-    """Motion of T frames, float32; angles are rotation vectors [rad]. Keys that the file lacks are zero.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Driving(HeadParams):
+    """Motion from a file, with its frame rate and the meaning of its expression columns.
+
+    Parameters that the file lacks are zero, and expression coefficients are as many as the file has.
 
     Attributes:
-        expr: Expression coefficients, as many as the file has, shape [T, E].
-        rotation: Root rotation about the root joint, shape [T, 3].
-        neck_pose: Shape [T, 3].
-        jaw_pose: Shape [T, 3].
-        eyes_pose: Left, then right eye, shape [T, 6].
-        translation: Added after skinning [m], shape [T, 3].
         fps: Frames per second, 25 if the file does not say.
-        expr_basis: What the expression columns mean, if the file says.
+        expr_basis: Basis of the expression columns, if the file names it.
         expr_names: Names of the expression columns, or an empty tuple.
         path: The file or folder.
-        notes: What was not used, a line each, for the user to see.
+        notes: Arrays that were not used, one line each, for the user.
     """
 
-    expr: np.ndarray
-    rotation: np.ndarray
-    neck_pose: np.ndarray
-    jaw_pose: np.ndarray
-    eyes_pose: np.ndarray
-    translation: np.ndarray
-    fps: float
-    expr_basis: str | None
-    expr_names: tuple[str, ...]
+    fps: float = DEFAULT_FPS
+    expr_basis: str | None = None
+    expr_names: tuple[str, ...] = ()
     path: Path
     notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.expr)
 
 
 def read_driving(path: Path) -> Driving:

@@ -16,7 +16,7 @@ from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, Subject
 from mgavatar.driving.cameras import turned_cameras
 from mgavatar.driving.writers import to_bytes
-from mgavatar.head.params import Pose, pose_of
+from mgavatar.head.params import Pose
 from mgavatar.kernels.ray_cast import RayMesh, camera_rays
 from mgavatar.scoring.evaluate import evaluation_pose, spread
 from mgavatar.scoring.geometry import tracked_shape, vertex_normals
@@ -74,7 +74,7 @@ def first_timestep(subject: Subject) -> int:
 def start_verts(avatar: Avatar, subject: Subject, timestep: int) -> Tensor:
     """Where the fit began: the parametric head in the tracked pose [m], shape [V, 3]."""
     body, shaped = avatar.head.body, tracked_shape(avatar)
-    pose = pose_of(subject.params, timestep, avatar.head_model.n_expr).to(avatar.device)
+    pose = subject.params.pose(timestep, n_expr=avatar.head_model.n_expr).to(avatar.device)
     return body.posed(shaped, pose, joints=avatar.head.joints(shaped))
 
 

@@ -17,7 +17,7 @@ from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, Split, Subject
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
-from mgavatar.head.params import HeadParams, Pose, pose_of
+from mgavatar.head.params import HeadParams, Pose
 from mgavatar.losses import ssim
 from mgavatar.scoring.baselines import NaiveBaselines
 from mgavatar.scoring.geometry import score_geometry
@@ -154,7 +154,7 @@ def evaluation_pose(avatar: Avatar, subject: Subject, timestep: int) -> Pose:
     """The pose to score a timestep with: as refined where the fit has seen it, else as tracked."""
     if timestep in avatar.capture.train_timesteps and is_own_capture(avatar, subject):
         return avatar.head.pose(timestep)
-    return pose_of(subject.params, timestep, avatar.head_model.n_expr)
+    return subject.params.pose(timestep, n_expr=avatar.head_model.n_expr)
 
 
 def _geometry_poses(avatar: Avatar, subject: Subject) -> dict[int, Pose]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
-from mgavatar.head.params import Pose, pad_or_truncate, pose_of
+from mgavatar.head.params import Pose, pad_or_truncate
 from mgavatar.kernels.closest_point import closest_points
 from mgavatar.kernels.self_intersection import crossing_faces
 from mgavatar.scoring.truth import Truth
@@ -95,7 +95,7 @@ def step_meshes(avatar: Avatar, subject: Subject, timestep: int, pose: Pose) -> 
     """
     head, body = avatar.head, avatar.head.body
     pose = pose.to(avatar.device)
-    start, tracked = tracked_shape(avatar), pose_of(subject.params, timestep, avatar.head_model.n_expr)
+    start, tracked = tracked_shape(avatar), subject.params.pose(timestep, n_expr=avatar.head_model.n_expr)
     final = head.posed(pose)
     canonical = final.shaped + final.identity_offsets
     return StepMeshes(

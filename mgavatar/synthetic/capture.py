@@ -22,8 +22,9 @@ from mgavatar.camera import Camera
 from mgavatar.capture.subject import SPLITS, Split
 from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
+from mgavatar.head.params import MOTION_KEYS, HeadParams, pad_or_truncate
 from mgavatar.synthetic.motion import perform, tracked
-from mgavatar.synthetic.person import Person, Pose, make_person
+from mgavatar.synthetic.person import Person, make_person
 from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
 
 _TURN = math.radians(20)
@@ -81,16 +82,16 @@ def make_synthetic_capture(
     rng = np.random.default_rng(seed)
     person = make_person(head, rng)
     studio = Studio(person, make_look(person, rng))
-    poses = perform(head, timesteps, rng, turn=_TURN)
+    motion = perform(head, timesteps, rng, turn=_TURN)
     views = [front_camera(size), *side_cameras(size)] if monocular else frontal_arc(cameras, size)
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
     try:
         partial.mkdir(parents=True)
         members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
-        truth = _shoot_all(partial, studio, poses, views, members, progress)
-        _write_params(partial, head, tracked(poses, rng))
+        truth = _shoot_all(partial, studio, motion, views, members, progress)
+        _write_params(partial, head, tracked(motion, rng))
         _write_transforms(partial, views, members)
-        _write_truth(partial, person, poses, seed, *truth)
+        _write_truth(partial, person, motion, seed, *truth)
         if out.exists():
             out.rmdir()
         partial.rename(out)
@@ -145,7 +146,7 @@ def _n_train(timesteps: int) -> int:
 def _shoot_all(
     root: Path,
     studio: Studio,
-    poses: list[Pose],
+    motion: HeadParams,
     views: list[Camera],
     members: Members,
     progress: Callable[[int, int], None] | None,
@@ -157,8 +158,8 @@ def _shoot_all(
     every, done = set().union(*members.values()), 0
     saved: list[Future[None]] = []
     with ThreadPoolExecutor(1) as writer:
-        for t, pose in enumerate(poses):
-            studio.stage(pose)
+        for t in range(len(motion)):
+            studio.stage(motion, t)
             vertices.append(studio.verts.astype(np.float32))
             for c in sorted(c for at, c in every if at == t):
                 image, mask = studio.shoot(views[c])
@@ -182,27 +183,19 @@ def _save(pixels: np.ndarray, path: Path) -> None:
     Image.fromarray(pixels).save(path, compress_level=1)
 
 
-def _write_params(root: Path, head: HeadModel, poses: list[Pose]) -> None:
+def _write_params(root: Path, head: HeadModel, motion: HeadParams) -> None:
     (root / "flame_param").mkdir()
     n_expr = max(head.n_expr, _N_EXPR)
-    for t, pose in enumerate(poses):
-        _save_arrays(root / "flame_param" / f"{t:05d}.npz", **_vhap(pose, n_expr))
-    still = Pose(np.zeros(head.n_expr), *(np.zeros(n) for n in (3, 3, 3, 6, 3)))
-    opened = {**_vhap(still, n_expr), "jaw_pose": np.array([[0.3, 0.0, 0.0]])}  # float64, as VHAP writes it
+    for t in range(len(motion)):
+        _save_arrays(root / "flame_param" / f"{t:05d}.npz", **_vhap(motion, t, n_expr))
+    neutral = _vhap(HeadParams.neutral(n_frames=1, n_expr=head.n_expr), 0, n_expr)
+    opened = {**neutral, "jaw_pose": np.array([[0.3, 0.0, 0.0]])}  # float64, as VHAP writes it
     _save_arrays(root / "canonical_flame_param.npz", **opened)
 
 
-def _vhap(pose: Pose, n_expr: int) -> dict[str, np.ndarray]:
-    values = {
-        "expr": np.pad(pose.expr, (0, n_expr - len(pose.expr))),
-        "rotation": pose.rotation,
-        "neck_pose": pose.neck_pose,
-        "jaw_pose": pose.jaw_pose,
-        "eyes_pose": pose.eyes_pose,
-        "translation": pose.translation,
-    }
-    rows = {name: value[None].astype(np.float32) for name, value in values.items()}
-    return {"shape": np.zeros(_N_SHAPE, np.float32), **rows}
+def _vhap(motion: HeadParams, frame: int, n_expr: int) -> dict[str, np.ndarray]:
+    rows = {name: getattr(motion, name)[frame : frame + 1].astype(np.float32) for name in MOTION_KEYS}
+    return {"shape": np.zeros(_N_SHAPE, np.float32), **rows, "expr": pad_or_truncate(rows["expr"], n_expr)}
 
 
 def _write_transforms(root: Path, views: list[Camera], members: Members) -> None:
@@ -251,13 +244,10 @@ def _lens(camera: Camera) -> dict[str, Any]:
 
 
 def _write_truth(
-    root: Path, person: Person, poses: list[Pose], seed: int, vertices: np.ndarray, seen: np.ndarray
+    root: Path, person: Person, motion: HeadParams, seed: int, vertices: np.ndarray, seen: np.ndarray
 ) -> None:
     (root / "ground_truth").mkdir()
-    motion = {
-        f"true_{name}": np.stack([getattr(pose, name) for pose in poses]).astype(np.float32)
-        for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
-    }
+    true_motion = {f"true_{name}": getattr(motion, name).astype(np.float32) for name in MOTION_KEYS}
     _save_arrays(
         root / "ground_truth" / "truth.npz",
         vertices=vertices,
@@ -265,7 +255,7 @@ def _write_truth(
         seen=seen,
         **{f"mask_{name}": mask for name, mask in person.masks.items()},
         true_shape=person.betas.astype(np.float32),
-        **motion,
+        **true_motion,
         expr_basis=np.array(person.head.expr_basis),
         head_model=np.array(person.head.name),
         seed=np.array(seed),

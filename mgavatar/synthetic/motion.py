@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mgavatar.head.model import HeadModel
-from mgavatar.synthetic.person import Pose, vertex_regions
+from mgavatar.head.params import MOTION_KEYS, HeadParams
+from mgavatar.synthetic.person import vertex_regions
 
 _ACTIONS = {
     "smile": ("smile",),
@@ -22,7 +23,7 @@ _LARGEST = 0.009
 """No expression moves a vertex further than this [m], whatever the units of the model's directions; blinks may."""
 
 
-def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: float) -> list[Pose]:
+def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: float) -> HeadParams:
     """Smooth motion of ``timesteps`` frames: head turns and nods, speech, expressions, gaze, sway of the body.
 
     Args:
@@ -45,30 +46,27 @@ def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: 
     zero = 0.0 * u
     neck = np.stack([pitch, yaw, roll], axis=1)
     eyes = np.stack([gaze_x, gaze_y, zero, gaze_x, gaze_y, zero], axis=1)
-    return [
-        Pose(expr[t], sway[t], neck[t], np.array([jaw[t], 0.012 * np.sin(9 * u[t]), 0.0]), eyes[t], shift[t])
-        for t in range(timesteps)
-    ]
+    return HeadParams(
+        expr=expr,
+        rotation=sway,
+        neck_pose=neck,
+        jaw_pose=np.stack([jaw, 0.012 * np.sin(9 * u), zero], axis=1),
+        eyes_pose=eyes,
+        translation=shift,
+    )
 
 
-def tracked(poses: list[Pose], rng: np.random.Generator) -> list[Pose]:
-    """The same motion with a tracker's errors: 0.3 degrees, 0.5 mm and, where a direction is used, 0.03."""
-
-    def rotation(values: np.ndarray) -> np.ndarray:
-        return values + np.radians(0.3) * rng.standard_normal(values.shape)
-
-    used = np.any([pose.expr != 0 for pose in poses], axis=0)
-    return [
-        Pose(
-            expr=pose.expr + 0.03 * used * rng.standard_normal(pose.expr.shape),
-            rotation=rotation(pose.rotation),
-            neck_pose=rotation(pose.neck_pose),
-            jaw_pose=rotation(pose.jaw_pose),
-            eyes_pose=rotation(pose.eyes_pose),
-            translation=pose.translation + 5e-4 * rng.standard_normal(3),
-        )
-        for pose in poses
-    ]
+def tracked(motion: HeadParams, rng: np.random.Generator) -> HeadParams:
+    """Return a motion with a tracker's errors: 0.3 degrees, 0.5 mm and, where a direction is used, 0.03."""
+    used = motion.expr.any(axis=0)
+    sigmas = dict.fromkeys(MOTION_KEYS, np.radians(0.3)) | {"expr": 0.03 * used, "translation": 5e-4}
+    noisy: dict[str, list[np.ndarray]] = {name: [] for name in MOTION_KEYS}
+    # Frame by frame: the order of the draws decides which capture a seed means.
+    for frame in range(len(motion)):
+        for name in MOTION_KEYS:
+            values = getattr(motion, name)[frame]
+            noisy[name].append(values + sigmas[name] * rng.standard_normal(values.shape))
+    return HeadParams(**{name: np.stack(rows) for name, rows in noisy.items()})
 
 
 def action_columns(head: HeadModel) -> dict[str, np.ndarray]:

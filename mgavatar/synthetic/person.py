@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mgavatar.head.model import HeadModel
+from mgavatar.head.params import HeadParams
 from mgavatar.synthetic.garment import drape
 
 SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
@@ -17,18 +18,6 @@ SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
 
 _MIN_FACES = 30_000
 """The head is subdivided until hair and silhouette have at least this many faces, at most twice."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """True parameters of one timestep: FLAME's, float64; angles are rotation vectors [rad]."""
-
-    expr: np.ndarray
-    rotation: np.ndarray
-    neck_pose: np.ndarray
-    jaw_pose: np.ndarray
-    eyes_pose: np.ndarray
-    translation: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,22 +50,23 @@ class Person:
     marks: np.ndarray
     masks: dict[str, np.ndarray]
 
-    def posed(self, pose: Pose | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices in world space [m], shape [H + G, 3], and the rotation of each, shape [H + G, 3, 3], float64.
+    def posed(self, motion: HeadParams, frame: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices in world space [m], [H + G, 3], and the rotation of each, [H + G, 3, 3], float64.
 
         FLAME's forward function (linear blend skinning about joints regressed from the shaped vertices), then muscles
         and hair that follow the neck.
         """
-        pose = pose or _rest_pose(self.head)
-        shaped = shaped_vertices(self.head, self.betas, pose.expr)
+        shaped = shaped_vertices(self.head, self.betas, motion.expr[frame])
+        neck_pose = motion.neck_pose[frame]
         joints = self.head.J_regressor.astype(np.float64) @ shaped
-        rotvecs = np.concatenate([pose.rotation, pose.neck_pose, pose.jaw_pose, pose.eyes_pose]).reshape(5, 3)
+        joint_rotvecs = (motion.rotation[frame], neck_pose, motion.jaw_pose[frame], motion.eyes_pose[frame])
+        rotvecs = np.concatenate(joint_rotvecs).reshape(5, 3)
         rotations = Rotation.from_rotvec(rotvecs).as_matrix()
         shaped = shaped + self.head.posedirs.astype(np.float64) @ (rotations[1:] - np.eye(3)).reshape(-1)
-        moved = np.concatenate([self.fine @ shaped + self.hair, self.garment]) + self._correctives(pose.neck_pose)
+        moved = np.concatenate([self.fine @ shaped + self.hair, self.garment]) + self._correctives(neck_pose)
         transforms = _joint_transforms(rotations, joints, self.head.parents)
         blended = np.einsum("vj,jab->vab", self.lbs_weights, transforms)
-        verts = np.einsum("vab,vb->va", blended[:, :3, :3], moved) + blended[:, :3, 3] + pose.translation
+        verts = np.einsum("vab,vb->va", blended[:, :3, :3], moved) + blended[:, :3, 3] + motion.translation[frame]
         return verts, blended[:, :3, :3]
 
     def _correctives(self, neck_pose: np.ndarray) -> np.ndarray:
@@ -273,8 +263,3 @@ def _joint_transforms(rotations: np.ndarray, joints: np.ndarray, parents: np.nda
     stacked = np.stack(world)
     stacked[:, :3, 3] -= np.einsum("jab,jb->ja", stacked[:, :3, :3], joints)
     return stacked
-
-
-def _rest_pose(head: HeadModel) -> Pose:
-    zero = np.zeros(3)
-    return Pose(np.zeros(head.n_expr), zero, zero, zero, np.zeros(6), zero)

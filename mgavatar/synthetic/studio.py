@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from mgavatar.camera import Camera, look_at
+from mgavatar.head.params import HeadParams
 from mgavatar.kernels.portrait import N_SAMPLES, Look, View, portrait
 from mgavatar.kernels.ray_cast import RayMesh, camera_rays
-from mgavatar.synthetic.person import Person, Pose, vertex_normals
+from mgavatar.synthetic.person import Person, vertex_normals
 
 _DISTANCE = 1.0
 _TARGET = np.array([0.0, -0.035, -0.02])
@@ -28,7 +29,7 @@ class Studio:
     def __init__(self, person: Person, look: Look) -> None:
         self.person = person
         self.look = look
-        verts, _ = person.posed()
+        verts, _ = person.posed(HeadParams.neutral(n_frames=1, n_expr=person.head.n_expr), 0)
         self.mesh = RayMesh(_tensor(verts), torch.from_numpy(person.faces))
         sky = open_sky(self.mesh, verts, vertex_normals(verts, person.faces))
         marks = np.column_stack([person.marks[:, :2], sky, person.marks[:, 2]])
@@ -42,9 +43,9 @@ class Studio:
         self._samples = _tensor(qmc.Sobol(2, scramble=False).random(N_SAMPLES) + 0.5 / N_SAMPLES)
         self.verts = verts
 
-    def stage(self, pose: Pose) -> None:
-        """Pose the person."""
-        self.verts, rotations = self.person.posed(pose)
+    def stage(self, motion: HeadParams, frame: int) -> None:
+        """Pose the person as in one frame of a motion."""
+        self.verts, rotations = self.person.posed(motion, frame)
         self.mesh.move(_tensor(self.verts))
         flow = np.einsum("vab,vb->va", rotations, self._flow)
         self._moving = (_tensor(vertex_normals(self.verts, self.person.faces)), _tensor(flow))

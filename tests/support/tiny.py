@@ -28,7 +28,6 @@ from mgavatar.fitting.views import Views
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Body
 from mgavatar.head.model import HeadModel
-from mgavatar.head.params import pose_of
 from mgavatar.kernels.ray_cast import camera_rays, ray_cast
 
 SIZE = (40, 40)
@@ -77,7 +76,7 @@ def write_tiny_capture(root: Path, *, n_timesteps: int = 4) -> Path:
     neutral = body.shaped(torch.tensor(subject.params.shape)) * torch.tensor(STRETCH)
     for split in subject.frames.values():
         for frame in split:
-            pose = pose_of(subject.params, frame.timestep, body.model.n_expr)
+            pose = subject.params.pose(frame.timestep, n_expr=body.model.n_expr)
             verts = body.posed(neutral, pose, joints=body.joints(neutral))
             pixels, mask = _picture(verts, neutral, body.faces, frame.camera)
             Image.fromarray(pixels).save(frame.image_path)

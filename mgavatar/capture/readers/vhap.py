@@ -15,13 +15,13 @@ from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
 from mgavatar.capture.transforms import FrameReader, PrincipalPoint, camera_of_frame
 from mgavatar.errors import DataError
 from mgavatar.files import float_array, one_line, read_json, read_npz
-from mgavatar.head.params import HeadParams
+from mgavatar.head.params import POSE_WIDTHS, HeadParams
 
 Background = Literal["white", "black"]
 
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
-PARAM_WIDTHS = {"expr": None, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
+PARAM_WIDTHS: dict[str, int | None] = {"expr": None, **POSE_WIDTHS}
 
 MAX_PARAM_BYTES = 64 << 20
 
