@@ -38,21 +38,21 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def bind_kernel(
-        first: int,
         # In:
-        face_quats: wp.array(dtype=vec4),  # [F]
-        face_scales: wp.array(dtype=scalar),  # [F]
-        face_centers: wp.array(dtype=vec3),  # [F]
-        face_ids: wp.array(dtype=wp.int64),  # [N]
-        local_means: wp.array(dtype=vec3),  # [N]
-        local_quats: wp.array(dtype=vec4),  # [N]
-        local_scales: wp.array(dtype=vec3),  # [N]
-        offsets: wp.array(dtype=scalar),  # [13 N] or empty
+        first: int,
+        face_quats: wp.array[vec4],  # [F]
+        face_scales: wp.array[scalar],  # [F]
+        face_centers: wp.array[vec3],  # [F]
+        face_ids: wp.array[wp.int64],  # [N]
+        local_means: wp.array[vec3],  # [N]
+        local_quats: wp.array[vec4],  # [N]
+        local_scales: wp.array[vec3],  # [N]
+        offsets: wp.array[scalar],  # [13 N] or empty
         # Out:
-        means: wp.array(dtype=vec3),  # [N]
-        quats: wp.array(dtype=vec4),  # [N]
-        scales: wp.array(dtype=vec3),  # [N]
-        colors: wp.array(dtype=vec3),  # [N]
+        means: wp.array[vec3],  # [N]
+        quats: wp.array[vec4],  # [N]
+        scales: wp.array[vec3],  # [N]
+        colors: wp.array[vec3],  # [N]
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]
@@ -71,28 +71,28 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def bind_bwd_kernel(
-        first: int,
         # In:
-        face_quats: wp.array(dtype=vec4),  # [F]
-        face_scales: wp.array(dtype=scalar),  # [F]
-        face_ids: wp.array(dtype=wp.int64),  # [N]
-        local_means: wp.array(dtype=vec3),  # [N]
-        local_quats: wp.array(dtype=vec4),  # [N]
-        local_scales: wp.array(dtype=vec3),  # [N]
-        opacities: wp.array(dtype=scalar),  # [N]
-        offsets: wp.array(dtype=scalar),  # [13 N] or empty
-        v_means: wp.array(dtype=vec3),  # [N]
-        v_quats: wp.array(dtype=vec4),  # [N]
-        v_scales: wp.array(dtype=vec3),  # [N]
-        v_opacities: wp.array(dtype=scalar),  # [N]
-        v_colors: wp.array(dtype=vec3),  # [N]
+        first: int,
+        face_quats: wp.array[vec4],  # [F]
+        face_scales: wp.array[scalar],  # [F]
+        face_ids: wp.array[wp.int64],  # [N]
+        local_means: wp.array[vec3],  # [N]
+        local_quats: wp.array[vec4],  # [N]
+        local_scales: wp.array[vec3],  # [N]
+        opacities: wp.array[scalar],  # [N]
+        offsets: wp.array[scalar],  # [13 N] or empty
+        v_means: wp.array[vec3],  # [N]
+        v_quats: wp.array[vec4],  # [N]
+        v_scales: wp.array[vec3],  # [N]
+        v_opacities: wp.array[scalar],  # [N]
+        v_colors: wp.array[vec3],  # [N]
         # Out:
-        v_local_means: wp.array(dtype=vec3),  # [N]
-        v_local_quats: wp.array(dtype=vec4),  # [N]
-        v_log_scales: wp.array(dtype=vec3),  # [N]
-        v_logits: wp.array(dtype=scalar),  # [N]
-        v_offsets: wp.array(dtype=scalar),  # [13 N] or empty
-        v_frames: wp.array2d(dtype=scalar),  # [N, 8] share of each Gaussian: quaternion, scale, centre; or empty
+        v_local_means: wp.array[vec3],  # [N]
+        v_local_quats: wp.array[vec4],  # [N]
+        v_log_scales: wp.array[vec3],  # [N]
+        v_logits: wp.array[scalar],  # [N]
+        v_offsets: wp.array[scalar],  # [13 N] or empty
+        v_frames: wp.array2d[scalar],  # [N, 8] share of each Gaussian: quaternion, scale, centre; or empty
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]
@@ -137,15 +137,15 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def place_kernel(
-        first: int,
         # In:
-        face_quats: wp.array(dtype=vec4),  # [F]
-        face_scales: wp.array(dtype=scalar),  # [F]
-        face_centers: wp.array(dtype=vec3),  # [F]
-        face_ids: wp.array(dtype=wp.int64),  # [N]
-        local_means: wp.array(dtype=vec3),  # [N]
+        first: int,
+        face_quats: wp.array[vec4],  # [F]
+        face_scales: wp.array[scalar],  # [F]
+        face_centers: wp.array[vec3],  # [F]
+        face_ids: wp.array[wp.int64],  # [N]
+        local_means: wp.array[vec3],  # [N]
         # Out:
-        means: wp.array(dtype=vec3),  # [N]
+        means: wp.array[vec3],  # [N]
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]
@@ -153,15 +153,15 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def directions_kernel(
-        first: int,
         # In:
-        means: wp.array(dtype=vec3),  # [N]
-        position: wp.array(dtype=vec3),  # [1]
-        face_ids: wp.array(dtype=wp.int64),  # [N]
-        from_quats: wp.array(dtype=vec4),  # [F]
-        to_quats: wp.array(dtype=vec4),  # [F]
+        first: int,
+        means: wp.array[vec3],  # [N]
+        position: wp.array[vec3],  # [1]
+        face_ids: wp.array[wp.int64],  # [N]
+        from_quats: wp.array[vec4],  # [F]
+        to_quats: wp.array[vec4],  # [F]
         # Out:
-        directions: wp.array(dtype=vec3),  # [N]
+        directions: wp.array[vec3],  # [N]
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]

@@ -112,10 +112,10 @@ def _kernels(real: Real) -> SimpleNamespace:
     def add_directions(
         item: int,
         width: int,
-        dirs: wp.array2d(dtype=scalar),
-        coeffs: wp.array(dtype=scalar),
-        start: wp.array(dtype=scalar),
-        out: wp.array(dtype=scalar),
+        dirs: wp.array2d[scalar],
+        coeffs: wp.array[scalar],
+        start: wp.array[scalar],
+        out: wp.array[scalar],
     ) -> None: ...
 
     @native(_DOT_SNIPPET)
@@ -123,33 +123,33 @@ def _kernels(real: Real) -> SimpleNamespace:
         k: int,
         lane: int,
         width: int,
-        dirs: wp.array2d(dtype=scalar),
-        grad: wp.array(dtype=scalar),
-        partial: wp.array2d(dtype=scalar),
+        dirs: wp.array2d[scalar],
+        grad: wp.array[scalar],
+        partial: wp.array2d[scalar],
     ) -> None: ...
 
     @wp.kernel(module=module, enable_backward=False)
     def blend_kernel(
-        first: int,
         # In:
+        first: int,
         width: int,  # numbers an item owns
-        dirs: wp.array2d(dtype=scalar),  # [K, 3V]
-        coeffs: wp.array(dtype=scalar),  # [K]
-        start: wp.array(dtype=scalar),  # [3V]
+        dirs: wp.array2d[scalar],  # [K, 3V]
+        coeffs: wp.array[scalar],  # [K]
+        start: wp.array[scalar],  # [3V]
         # Out:
-        out: wp.array(dtype=scalar),  # [3V]
+        out: wp.array[scalar],  # [3V]
     ) -> None:
         add_directions(first + wp.tid(), width, dirs, coeffs, start, out)
 
     @wp.kernel(module=module, enable_backward=False)
     def blend_bwd_kernel(
-        first: int,
         # In:
+        first: int,
         width: int,  # lanes an item owns: 1, or all those of a few directions
-        dirs: wp.array2d(dtype=scalar),  # [K, 3V]
-        grad: wp.array(dtype=scalar),  # [3V]
+        dirs: wp.array2d[scalar],  # [K, 3V]
+        grad: wp.array[scalar],  # [3V]
         # Out:
-        partial: wp.array2d(dtype=scalar),  # [K, lanes]
+        partial: wp.array2d[scalar],  # [K, lanes]
     ) -> None:
         begin = (first + wp.tid()) * width
         dot_direction(begin // wp.static(_LANES), begin % wp.static(_LANES), width, dirs, grad, partial)
@@ -157,9 +157,9 @@ def _kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def sum_kernel(
         # In:
-        partial: wp.array2d(dtype=scalar),  # [M, N]
+        partial: wp.array2d[scalar],  # [M, N]
         # Out:
-        out: wp.array(dtype=scalar),  # [M]
+        out: wp.array[scalar],  # [M]
     ) -> None:
         m = wp.tid()
         total = scalar(0.0)

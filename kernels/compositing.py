@@ -50,9 +50,9 @@ _BLOCK_SUM = """
 def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     row10 = wp.types.vector(10, real)
     module = f"{__name__}_{real.__name__}"
-    snippet = _BLOCK_SUM.replace("REAL", {"float32": "float", "float64": "double"}[real.__name__])
+    c_name = {"float32": "float", "float64": "double"}[real.__name__]
 
-    @wp.func_native(snippet.replace("BLOCK", str(BLOCK)))
+    @wp.func_native(_BLOCK_SUM.replace("REAL", c_name).replace("BLOCK", str(BLOCK)))
     def block_sum(active: bool, values: row10, row: int, lane: int, partials: wp.array2d[real]): ...
 
     vec2 = wp.types.vector(2, real)

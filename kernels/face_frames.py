@@ -69,11 +69,11 @@ def _kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module)
     def face_frames_kernel(
         # In:
-        corners: wp.array2d(dtype=vec3),  # [F, 3]
+        corners: wp.array2d[vec3],  # [F, 3]
         # Out:
-        quats: wp.array(dtype=vec4),  # [F]
-        scales: wp.array(dtype=scalar),  # [F]
-        centers: wp.array(dtype=vec3),  # [F]
+        quats: wp.array[vec4],  # [F]
+        scales: wp.array[scalar],  # [F]
+        centers: wp.array[vec3],  # [F]
     ) -> None:
         f = wp.tid()
         a = corners[f, 0]

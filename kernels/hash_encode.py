@@ -168,10 +168,10 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         n_levels: int,
         begin: int,
         end: int,
-        points: wp.array2d(dtype=scalar),
-        table: wp.array2d(dtype=scalar),
-        levels: wp.array2d(dtype=int),
-        out: wp.array2d(dtype=scalar),
+        points: wp.array2d[scalar],
+        table: wp.array2d[scalar],
+        levels: wp.array2d[int],
+        out: wp.array2d[scalar],
     ) -> None: ...
 
     @native(_LOCATE + _TABLE_BWD.replace("ADD", _ADD_REAL))
@@ -180,11 +180,11 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         n_levels: int,
         begin: int,
         end: int,
-        points: wp.array2d(dtype=scalar),
-        grad: wp.array2d(dtype=scalar),
-        levels: wp.array2d(dtype=int),
-        sums: wp.array2d(dtype=scalar),
-        marks: wp.array(dtype=wp.uint8),
+        points: wp.array2d[scalar],
+        grad: wp.array2d[scalar],
+        levels: wp.array2d[int],
+        sums: wp.array2d[scalar],
+        marks: wp.array[wp.uint8],
     ) -> None: ...
 
     @native(_LOCATE + _TABLE_BWD.replace("ADD", _ADD_FIXED))
@@ -193,12 +193,12 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         n_levels: int,
         begin: int,
         end: int,
-        points: wp.array2d(dtype=scalar),
-        grad: wp.array2d(dtype=scalar),
-        scale: wp.array(dtype=wp.float64),
-        levels: wp.array2d(dtype=int),
-        sums: wp.array2d(dtype=wp.int64),
-        marks: wp.array(dtype=wp.uint8),
+        points: wp.array2d[scalar],
+        grad: wp.array2d[scalar],
+        scale: wp.array[wp.float64],
+        levels: wp.array2d[int],
+        sums: wp.array2d[wp.int64],
+        marks: wp.array[wp.uint8],
     ) -> None: ...
 
     @native(_LOCATE + _POINTS_BWD)
@@ -207,23 +207,23 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
         n_levels: int,
         begin: int,
         end: int,
-        points: wp.array2d(dtype=scalar),
-        table: wp.array2d(dtype=scalar),
-        grad: wp.array2d(dtype=scalar),
-        levels: wp.array2d(dtype=int),
-        grad_points: wp.array2d(dtype=scalar),
+        points: wp.array2d[scalar],
+        table: wp.array2d[scalar],
+        grad: wp.array2d[scalar],
+        levels: wp.array2d[int],
+        grad_points: wp.array2d[scalar],
     ) -> None: ...
 
     @wp.kernel(module=module, enable_backward=False)
     def encode_kernel(
-        first: int,
         # In:
+        first: int,
         width: int,  # points an item owns on one level
-        points: wp.array2d(dtype=scalar),  # [N, 3]
-        table: wp.array2d(dtype=scalar),  # [T, F]
-        levels: wp.array2d(dtype=int),  # [L, 3]
+        points: wp.array2d[scalar],  # [N, 3]
+        table: wp.array2d[scalar],  # [T, F]
+        levels: wp.array2d[int],  # [L, 3]
         # Out:
-        out: wp.array2d(dtype=scalar),  # [N, L F]
+        out: wp.array2d[scalar],  # [N, L F]
     ) -> None:
         n = points.shape[0]
         n_ranges = (n + width - 1) // width
@@ -233,14 +233,14 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def table_bwd_kernel(
-        first: int,
         # In:
-        points: wp.array2d(dtype=scalar),  # [N, 3]
-        grad: wp.array2d(dtype=scalar),  # [N, L F]
-        levels: wp.array2d(dtype=int),  # [L, 3]
-        # Out, sums of one level an item:
-        sums: wp.array2d(dtype=scalar),  # [T, F]
-        marks: wp.array(dtype=wp.uint8),  # [T / block]
+        first: int,
+        points: wp.array2d[scalar],  # [N, 3]
+        grad: wp.array2d[scalar],  # [N, L F]
+        levels: wp.array2d[int],  # [L, 3]
+        # Out:
+        sums: wp.array2d[scalar],  # [T, F] added to; an item owns one level
+        marks: wp.array[wp.uint8],  # [T / block]
     ) -> None:
         level = first + wp.tid()
         add_table_gradient(level, levels.shape[0], 0, points.shape[0], points, grad, levels, sums, marks)
@@ -248,13 +248,13 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def table_fixed_bwd_kernel(
         # In:
-        points: wp.array2d(dtype=scalar),  # [N, 3]
-        grad: wp.array2d(dtype=scalar),  # [N, L F]
-        scale: wp.array(dtype=wp.float64),  # [1]
-        levels: wp.array2d(dtype=int),  # [L, 3]
-        # Out, sums over all points:
-        sums: wp.array2d(dtype=wp.int64),  # [T, F]
-        marks: wp.array(dtype=wp.uint8),  # [T / block]
+        points: wp.array2d[scalar],  # [N, 3]
+        grad: wp.array2d[scalar],  # [N, L F]
+        scale: wp.array[wp.float64],  # [1]
+        levels: wp.array2d[int],  # [L, 3]
+        # Out:
+        sums: wp.array2d[wp.int64],  # [T, F] added to, by all points at once
+        marks: wp.array[wp.uint8],  # [T / block]
     ) -> None:
         level, n = wp.tid()
         add_fixed_gradient(level, levels.shape[0], n, n + 1, points, grad, scale, levels, sums, marks)
@@ -262,11 +262,11 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def from_fixed_kernel(
         # In:
-        scale: wp.array(dtype=wp.float64),  # [1]
-        marks: wp.array(dtype=wp.uint8),  # [T / block]
-        # In and out:
-        fixed: wp.array2d(dtype=wp.int64),  # [T, F], left at zero
-        sums: wp.array2d(dtype=scalar),  # [T, F]
+        scale: wp.array[wp.float64],  # [1]
+        marks: wp.array[wp.uint8],  # [T / block]
+        # Out:
+        fixed: wp.array2d[wp.int64],  # [T, F] read, then left at zero
+        sums: wp.array2d[scalar],  # [T, F] added to
     ) -> None:
         t, f = wp.tid()
         if marks[t // wp.static(BLOCK)] != wp.uint8(0):
@@ -275,15 +275,15 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def points_bwd_kernel(
-        first: int,
         # In:
+        first: int,
         width: int,  # points an item owns on all levels
-        points: wp.array2d(dtype=scalar),  # [N, 3]
-        table: wp.array2d(dtype=scalar),  # [T, F]
-        grad: wp.array2d(dtype=scalar),  # [N, L F]
-        levels: wp.array2d(dtype=int),  # [L, 3]
-        # Out, sums that start at zero:
-        grad_points: wp.array2d(dtype=scalar),  # [N, 3]
+        points: wp.array2d[scalar],  # [N, 3]
+        table: wp.array2d[scalar],  # [T, F]
+        grad: wp.array2d[scalar],  # [N, L F]
+        levels: wp.array2d[int],  # [L, 3]
+        # Out:
+        grad_points: wp.array2d[scalar],  # [N, 3] zero at first, added to level by level
     ) -> None:
         begin = (first + wp.tid()) * width
         end = wp.min(begin + width, points.shape[0])

@@ -62,29 +62,29 @@ def _kernels(real: Real) -> SimpleNamespace:
         beta1: scalar,
         beta2: scalar,
         eps: scalar,
-        marks: wp.array(dtype=wp.uint8),
-        table: wp.array2d(dtype=scalar),
-        grad: wp.array2d(dtype=scalar),
-        means: wp.array2d(dtype=scalar),
-        squares: wp.array2d(dtype=scalar),
+        marks: wp.array[wp.uint8],
+        table: wp.array2d[scalar],
+        grad: wp.array2d[scalar],
+        means: wp.array2d[scalar],
+        squares: wp.array2d[scalar],
     ) -> None: ...
 
     @wp.kernel(module=f"{__name__}.{real.name}", enable_backward=False)
     def adam_kernel(
-        first: int,
         # In:
+        first: int,
         width: int,  # numbers an item owns
         rate: scalar,
         unbias: scalar,
         beta1: scalar,
         beta2: scalar,
         eps: scalar,
-        marks: wp.array(dtype=wp.uint8),  # [T / block]
-        # In and out:
-        table: wp.array2d(dtype=scalar),  # [T, F]
-        grad: wp.array2d(dtype=scalar),  # [T, F], left at zero
-        means: wp.array2d(dtype=scalar),  # [T, F]
-        squares: wp.array2d(dtype=scalar),  # [T, F]
+        marks: wp.array[wp.uint8],  # [T / block]
+        # Out:
+        table: wp.array2d[scalar],  # [T, F] moved where the gradient is not zero
+        grad: wp.array2d[scalar],  # [T, F] read, then left at zero
+        means: wp.array2d[scalar],  # [T, F] updated
+        squares: wp.array2d[scalar],  # [T, F] updated
     ) -> None:
         features = table.shape[1]
         begin = wp.int64(first + wp.tid()) * wp.int64(width)

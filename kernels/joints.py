@@ -71,14 +71,14 @@ def _rotation_bwd(w: wp.vec3d, grad: wp.mat33d) -> wp.vec3d:
 @wp.kernel(enable_backward=False)
 def _joints_kernel(
     # In:
-    joints: wp.array(dtype=wp.vec3d),  # [J]
-    poses: wp.array(dtype=wp.vec3d),  # [J]
-    parents: wp.array(dtype=int),  # [J]
+    joints: wp.array[wp.vec3d],  # [J]
+    poses: wp.array[wp.vec3d],  # [J]
+    parents: wp.array[int],  # [J]
     # Out:
-    transforms: wp.array(dtype=wp.mat44d),  # [J]
-    feature: wp.array2d(dtype=_F),  # [J, 9], R - I of every joint
-    rotations: wp.array(dtype=wp.mat33d),  # [J], of the joint in posed space
-    posed: wp.array(dtype=wp.vec3d),  # [J], the joint in posed space
+    transforms: wp.array[wp.mat44d],  # [J]
+    feature: wp.array2d[_F],  # [J, 9], R - I of every joint
+    rotations: wp.array[wp.mat33d],  # [J], of the joint in posed space
+    posed: wp.array[wp.vec3d],  # [J], the joint in posed space
 ) -> None:
     zero = _F(0.0)
     for j in range(joints.shape[0]):
@@ -104,17 +104,17 @@ def _joints_kernel(
 @wp.kernel(enable_backward=False)
 def _joints_bwd_kernel(
     # In:
-    joints: wp.array(dtype=wp.vec3d),  # [J]
-    poses: wp.array(dtype=wp.vec3d),  # [J]
-    parents: wp.array(dtype=int),  # [J]
-    rotations: wp.array(dtype=wp.mat33d),  # [J]
-    grad_transforms: wp.array(dtype=wp.mat44d),  # [J]
-    grad_feature: wp.array2d(dtype=_F),  # [J, 9]
-    # Out, sums that start at zero:
-    grad_joints: wp.array(dtype=wp.vec3d),  # [J]
-    grad_poses: wp.array(dtype=wp.vec3d),  # [J]
-    grad_rotations: wp.array(dtype=wp.mat33d),  # [J]
-    grad_posed: wp.array(dtype=wp.vec3d),  # [J]
+    joints: wp.array[wp.vec3d],  # [J]
+    poses: wp.array[wp.vec3d],  # [J]
+    parents: wp.array[int],  # [J]
+    rotations: wp.array[wp.mat33d],  # [J]
+    grad_transforms: wp.array[wp.mat44d],  # [J]
+    grad_feature: wp.array2d[_F],  # [J, 9]
+    # Out:
+    grad_joints: wp.array[wp.vec3d],  # [J] zero at first: children add to their parents
+    grad_poses: wp.array[wp.vec3d],  # [J]
+    grad_rotations: wp.array[wp.mat33d],  # [J] zero at first
+    grad_posed: wp.array[wp.vec3d],  # [J] zero at first
 ) -> None:
     n = joints.shape[0]
     for i in range(n):

@@ -28,7 +28,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     module = f"{__name__}.{real.name}"
 
     @wp.func
-    def blended(v: int, weights: wp.array2d(dtype=scalar), transforms: wp.array(dtype=mat44)) -> mat44:
+    def blended(v: int, weights: wp.array2d[scalar], transforms: wp.array[mat44]) -> mat44:
         """The transform of a vertex: its joints' transforms by their weights."""
         total = mat44()
         for j in range(transforms.shape[0]):
@@ -37,13 +37,13 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def skin_kernel(
-        first: int,
         # In:
-        verts: wp.array(dtype=vec3),  # [V]
-        weights: wp.array2d(dtype=scalar),  # [V, J]
-        transforms: wp.array(dtype=mat44),  # [J]
+        first: int,
+        verts: wp.array[vec3],  # [V]
+        weights: wp.array2d[scalar],  # [V, J]
+        transforms: wp.array[mat44],  # [J]
         # Out:
-        out: wp.array(dtype=vec3),  # [V]
+        out: wp.array[vec3],  # [V]
     ) -> None:
         v = first + wp.tid()
         p = verts[v]
@@ -52,13 +52,13 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def skin_verts_bwd_kernel(
-        first: int,
         # In:
-        weights: wp.array2d(dtype=scalar),  # [V, J]
-        transforms: wp.array(dtype=mat44),  # [J]
-        grad: wp.array(dtype=vec3),  # [V]
+        first: int,
+        weights: wp.array2d[scalar],  # [V, J]
+        transforms: wp.array[mat44],  # [J]
+        grad: wp.array[vec3],  # [V]
         # Out:
-        grad_verts: wp.array(dtype=vec3),  # [V]
+        grad_verts: wp.array[vec3],  # [V]
     ) -> None:
         v = first + wp.tid()
         g = grad[v]
@@ -67,13 +67,13 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.kernel(module=module, enable_backward=False)
     def skin_transforms_bwd_kernel(
-        first: int,
         # In:
-        verts: wp.array(dtype=vec3),  # [V]
-        weights: wp.array2d(dtype=scalar),  # [V, J]
-        grad: wp.array(dtype=vec3),  # [V]
+        first: int,
+        verts: wp.array[vec3],  # [V]
+        weights: wp.array2d[scalar],  # [V, J]
+        grad: wp.array[vec3],  # [V]
         # Out:
-        partial: wp.array2d(dtype=mat34),  # [J, chunks]
+        partial: wp.array2d[mat34],  # [J, chunks]
     ) -> None:
         item = first + wp.tid()
         j = item // partial.shape[1]
@@ -87,9 +87,9 @@ def _kernels(real: Real) -> SimpleNamespace:
     @wp.kernel(module=module, enable_backward=False)
     def sum_transforms_kernel(
         # In:
-        partial: wp.array2d(dtype=mat34),  # [J, chunks]
+        partial: wp.array2d[mat34],  # [J, chunks]
         # Out:
-        grad_transforms: wp.array3d(dtype=scalar),  # [J, 4, 4]
+        grad_transforms: wp.array3d[scalar],  # [J, 4, 4]
     ) -> None:
         j, r, c = wp.tid()
         total = scalar(0.0)

@@ -228,14 +228,14 @@ def _differentiate_range(
 
 @wp.kernel
 def _mlp_kernel(
-    first: int,
     # In:
+    first: int,
     n_items: int,
     first_part: wp.array2d[wp.float32],  # [N, C0]
     second_part: wp.array2d[wp.float32],  # [N, C1]
     layers: wp.array2d[int],  # [L, 4] inputs, outputs, first weight, first bias
-    transposed: wp.array[wp.float32],  # weights by input, then by output, padded
-    biases: wp.array[wp.float32],  # padded
+    transposed: wp.array[wp.float32],  # [W] all layers' weights by input, then by output, padded
+    biases: wp.array[wp.float32],  # [K'] padded
     # Out:
     out: wp.array2d[wp.float32],  # [N, K]
 ):
@@ -244,22 +244,22 @@ def _mlp_kernel(
 
 @wp.kernel
 def _mlp_bwd_kernel(
-    first: int,
     # In:
+    first: int,
     n_items: int,
     wants_points: int,
     first_part: wp.array2d[wp.float32],  # [N, C0]
     second_part: wp.array2d[wp.float32],  # [N, C1]
     layers: wp.array2d[int],  # [L, 4]
-    transposed: wp.array[wp.float32],  # weights by input, then by output, padded
-    biases: wp.array[wp.float32],  # padded
-    weights: wp.array[wp.float32],  # by output, then by input, padded
+    transposed: wp.array[wp.float32],  # [W] all layers' weights by input, then by output, padded
+    biases: wp.array[wp.float32],  # [K'] padded
+    weights: wp.array[wp.float32],  # [W] by output, then by input, padded
     v_out: wp.array2d[wp.float32],  # [N, K]
     # Out:
     v_first: wp.array2d[wp.float32],  # [N, C0], zero where v_out is
     v_second: wp.array2d[wp.float32],  # [N, C1]
-    weight_sums: wp.array2d[wp.float32],  # [items, ...] as weights
-    bias_sums: wp.array2d[wp.float32],  # [items, ...]
+    weight_sums: wp.array2d[wp.float32],  # [items, W] laid out as weights
+    bias_sums: wp.array2d[wp.float32],  # [items, K'] laid out as biases
 ):
     _differentiate_range(
         first + wp.tid(), n_items, wants_points, first_part, second_part, layers, transposed, biases, weights,

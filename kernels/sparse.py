@@ -59,24 +59,24 @@ def _kernels(real: Real) -> SimpleNamespace:
     @wp.func_native(_ROW_SNIPPET.replace("REAL", real.c_name))
     def multiply_row(
         row: int,
-        starts: wp.array(dtype=int),
-        cols: wp.array(dtype=int),
-        values: wp.array(dtype=scalar),
-        x: wp.array2d(dtype=scalar),
+        starts: wp.array[int],
+        cols: wp.array[int],
+        values: wp.array[scalar],
+        x: wp.array2d[scalar],
         channels: int,
-        out: wp.array2d(dtype=scalar),
+        out: wp.array2d[scalar],
     ) -> None: ...
 
     @wp.kernel(module=f"{__name__}.{real.name}", enable_backward=False)
     def multiply_kernel(
-        first: int,
         # In:
-        starts: wp.array(dtype=int),  # [M + 1]
-        cols: wp.array(dtype=int),  # [E]
-        values: wp.array(dtype=scalar),  # [E]
-        x: wp.array2d(dtype=scalar),  # [N, C]
+        first: int,
+        starts: wp.array[int],  # [M + 1]
+        cols: wp.array[int],  # [E]
+        values: wp.array[scalar],  # [E]
+        x: wp.array2d[scalar],  # [N, C]
         # Out:
-        out: wp.array2d(dtype=scalar),  # [M, C]
+        out: wp.array2d[scalar],  # [M, C]
     ) -> None:
         multiply_row(first + wp.tid(), starts, cols, values, x, x.shape[1], out)
 

@@ -45,11 +45,11 @@ def _texel_range(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
 @wp.kernel
 def _cover_kernel(
     # In:
-    corners: wp.array2d(dtype=wp.vec2d),  # [F, 3], in texels, row down
+    corners: wp.array2d[wp.vec2d],  # [F, 3], in texels, row down
     width: int,
     height: int,
     # Out:
-    face_ids: wp.array(dtype=int),  # [H W], the smallest face over each texel
+    face_ids: wp.array[int],  # [H W], the smallest face over each texel
 ) -> None:
     f = wp.tid()
     a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
@@ -68,12 +68,12 @@ def _cover_kernel(
 @wp.kernel
 def _weights_kernel(
     # In:
-    corners: wp.array2d(dtype=wp.vec2d),  # [F, 3]
-    face_ids: wp.array(dtype=int),  # [E]
-    texels: wp.array(dtype=int),  # [E]
+    corners: wp.array2d[wp.vec2d],  # [F, 3]
+    face_ids: wp.array[int],  # [E]
+    texels: wp.array[int],  # [E]
     width: int,
     # Out:
-    weights: wp.array(dtype=wp.vec3d),  # [E]
+    weights: wp.array[wp.vec3d],  # [E]
 ) -> None:
     e = wp.tid()
     f = face_ids[e]
