@@ -12,7 +12,9 @@ import pytest
 import torch
 from tiny_avatar import tiny_avatar
 from torch import Tensor, nn
+from twins import image as twins
 
+from mgavatar import losses
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
 from mgavatar.capture.read import read_capture
@@ -20,10 +22,9 @@ from mgavatar.capture.subject import Subject
 from mgavatar.errors import DataError
 from mgavatar.head.params import Pose
 from mgavatar.kernels.rasterize import Rendering
-from mgavatar.losses import ssim
 from mgavatar.scoring.baselines import NaiveBaselines, pose_distances
 from mgavatar.scoring.evaluate import evaluate, evaluate_sample, write_metrics
-from mgavatar.scoring.image_metrics import psnr
+from mgavatar.scoring.image_metrics import image_metrics, psnr, ssim
 from mgavatar.scoring.lpips import Lpips, load_lpips, weight_shapes
 
 GRAY = 0.25
@@ -60,6 +61,29 @@ def test_psnr_by_hand() -> None:
     assert psnr(torch.zeros(3, 2, 2), torch.zeros(3, 2, 2)) == 100.0
 
 
+@pytest.mark.parametrize("size", [(1, 1), (4, 7), (11, 11), (33, 50)])
+def test_ssim_is_that_of_gaussian_splatting(size: tuple[int, int], rng: torch.Generator) -> None:
+    """The explicit window in double precision, and the loss that the fit minimises, agree, also below 11 pixels."""
+    image = torch.rand(3, *size, generator=rng)
+    target = (image + 0.2 * torch.rand(3, *size, generator=rng)).clamp(0.0, 1.0)
+    assert ssim(image, target) == pytest.approx(float(twins.ssim(image.double(), target.double())), abs=1e-5)
+    assert ssim(image, target) == pytest.approx(float(losses.ssim(image, target)), abs=1e-5)
+    assert ssim(image, image) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_image_metrics_are_one_record(rng: torch.Generator) -> None:
+    """The three scores of a pair; LPIPS only with weights; images of two shapes are refused."""
+    image, target = torch.rand(2, 3, 16, 16, generator=rng)
+    scores = image_metrics(image, target)
+    assert scores == {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": None}
+    assert image_metrics(image, target, lambda a, b: (a - b).abs().sum())["lpips"] == float(
+        (image - target).abs().sum()
+    )  # type: ignore[arg-type]
+    for score in (psnr, ssim, image_metrics):
+        with pytest.raises(ValueError, match=r"image has shape \(3, 16, 16\), but its target \(3, 16, 15\)"):
+            score(image, target[..., :15])
+
+
 def test_metrics_of_a_known_image(pair: tuple[Avatar, Subject], monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores are those of each image, averaged; the record has the keys that it promises."""
     avatar, subject = pair
@@ -68,9 +92,12 @@ def test_metrics_of_a_known_image(pair: tuple[Avatar, Subject], monkeypatch: pyt
     metrics = evaluate(
         avatar, subject, avatar_path=Path("a.pt"), splits=("val", "test"), progress=lambda *at: done.append(at)
     )
-    assert set(metrics) == {"avatar", "data", "device", "splits", "geometry", "seconds_per_frame"}
+    assert set(metrics) == {
+        "avatar", "data", "device", "splits", "geometry", "geometry_reason", "seconds_per_frame",
+    }  # fmt: skip
     assert metrics["avatar"] == "a.pt"
     assert metrics["geometry"] is None
+    assert metrics["geometry_reason"] == "the capture has no ground truth"
     assert metrics["seconds_per_frame"] > 0
     for split, task in (("val", "novel-view"), ("test", "self-reenactment")):
         score, images = metrics["splits"][split], _images(subject, split)
@@ -81,7 +108,7 @@ def test_metrics_of_a_known_image(pair: tuple[Avatar, Subject], monkeypatch: pyt
         assert score["frames"] == len(images)
         assert score["psnr"] == pytest.approx(np.mean([_db(GRAY, image) for image in images]), abs=1e-4)
         gray = torch.full(images.shape[1:], GRAY)
-        expected = np.mean([float(ssim(gray, torch.tensor(image, dtype=torch.float32))) for image in images])
+        expected = np.mean([float(twins.ssim(gray.double(), torch.tensor(image))) for image in images])
         assert score["ssim"] == pytest.approx(expected, abs=1e-6)
         assert score["lpips"] is None
         assert score["lpips_reason"] == "no weights given (--lpips-weights)"

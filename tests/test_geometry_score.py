@@ -18,8 +18,9 @@ from torch import Tensor
 from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.errors import DataError
-from mgavatar.scoring.evaluate import evaluate
+from mgavatar.scoring.evaluate import evaluate, evaluate_sample
 from mgavatar.scoring.geometry import STEPS, score_geometry
+from mgavatar.scoring.truth import check_ground_truth, read_ground_truth
 
 DISTANCES = {"mean_mm", "median_mm", "p95_mm", "normal_deg"}
 FOLDS = {"flipped_faces", "self_intersections"}
@@ -31,9 +32,9 @@ def pair(tmp_path: Path) -> tuple[Avatar, Subject]:
 
 
 def _score(avatar: Avatar, subject: Subject) -> dict[str, Any]:
-    score = score_geometry(avatar, subject, {t: avatar.head.pose(t) for t in range(3)})
-    assert score is not None
-    return score
+    truth = read_ground_truth(subject)
+    assert truth is not None
+    return score_geometry(avatar, subject, truth, {t: avatar.head.pose(t) for t in range(3)})
 
 
 def _with_truth(avatar: Avatar, subject: Subject, path: Path, *, out: float = 0.001, **more: np.ndarray) -> Subject:
@@ -49,7 +50,7 @@ def _with_truth(avatar: Avatar, subject: Subject, path: Path, *, out: float = 0.
 def test_geometry_of_a_known_offset(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
     """A truth one millimetre outside a convex mesh is one millimetre away from it."""
     avatar, subject = pair
-    assert score_geometry(avatar, subject, {}) is None
+    assert read_ground_truth(subject) is None
     score = _score(avatar, _with_truth(avatar, subject, tmp_path / "truth.npz"))
     assert set(score) == {*DISTANCES, *FOLDS, "regions", "steps"}
     for name in ("mean_mm", "median_mm", "p95_mm"):
@@ -171,7 +172,7 @@ def test_crossing_faces_that_the_offsets_added(
     shaped = avatar.head.shaped()
     spike = torch.zeros_like(shaped)
     spike[0] = -2.3 * shaped[0]
-    jaw = avatar.head.pose(1).jaw
+    jaw = avatar.head.pose(1).jaw_pose
     _offsets(avatar, monkeypatch, by_pose=lambda pose: spike * float(torch.equal(pose[3:6], jaw)))
     score = _score(avatar, known)
     assert score["self_intersections"] == {"fitted": 0, "parametric": 0, "added": 0}
@@ -212,21 +213,65 @@ def test_evaluate_scores_the_geometry_in_the_poses_of_the_images(pair: tuple[Ava
     assert geometry["steps"]["start"]["mean_mm"] > 0.1
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"vertices": np.zeros((2, 5, 3), np.float32)}, "a row of (V, 3) is needed for each timestep up to 3"),
-        ({"vertices": np.full((4, 42, 3), np.nan, np.float32)}, "NaN or infinite"),
-        ({"faces": np.array([[0, 1, 42]])}, "faces must be (F, 3) indices of its 42 vertices"),
-        ({"seen": np.zeros(3)}, "seen has shape (3,)"),
-        ({"seen": np.zeros(42)}, "leave no vertex to score"),
-    ],
-)
-def test_damaged_truths_are_refused(
-    pair: tuple[Avatar, Subject], tmp_path: Path, more: dict[str, np.ndarray], message: str
+DAMAGED = [
+    ({"vertices": np.zeros((2, 5, 3), np.float32)}, "a row of (V, 3) is needed for each timestep up to 3"),
+    ({"vertices": np.full((4, 42, 3), np.nan, np.float32)}, "NaN or infinite"),
+    ({"vertices": np.linspace(0.0, 240.0, 504, dtype=np.float32).reshape(4, 42, 3)}, "must be in metres"),
+    ({"faces": np.array([[0, 1, 42]])}, "faces must be (F, 3) indices of its 42 vertices"),
+    ({"seen": np.zeros(3)}, "seen has shape (3,)"),
+    ({"seen": np.zeros(42)}, "leave no vertex to score"),
+]
+
+
+@pytest.mark.parametrize(("more", "message"), DAMAGED)
+def test_damaged_truths_are_refused_before_any_work(
+    pair: tuple[Avatar, Subject],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    more: dict[str, np.ndarray],
+    message: str,
 ) -> None:
+    """By the check that comes before a fit, and by ``evaluate`` before it draws anything."""
     avatar, subject = pair
     damaged = _with_truth(avatar, subject, tmp_path / "truth.npz", **more)
-    with pytest.raises(DataError, match=r"truth\.npz") as caught:
-        _score(avatar, damaged)
-    assert message in str(caught.value)
+    monkeypatch.setattr(avatar, "render", lambda *_: pytest.fail("drew an image"))
+    for work in (
+        lambda: check_ground_truth(damaged),
+        lambda: evaluate(avatar, damaged, avatar_path=Path("a.pt"), splits=("val",)),
+    ):
+        with pytest.raises(DataError, match=r"truth\.npz") as caught:
+            work()
+        assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(("more", "message"), DAMAGED)
+def test_a_finished_fit_is_scored_without_a_truth_that_is_damaged(
+    pair: tuple[Avatar, Subject],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    more: dict[str, np.ndarray],
+    message: str,
+) -> None:
+    """Images keep their scores; the geometry has a reason in the place of its own, and a warning."""
+    avatar, subject = pair
+    damaged = _with_truth(avatar, subject, tmp_path / "truth.npz", **more)
+    metrics = evaluate_sample(avatar, damaged, avatar_path=Path("a.pt"), max_frames=1)
+    assert metrics["splits"]["val"]["psnr"] > 0
+    assert metrics["geometry"] is None
+    assert message in metrics["geometry_reason"]
+    assert f"geometry is not scored: {metrics['geometry_reason']}" in caplog.text
+
+
+def test_a_truth_out_of_reach_has_no_scores(
+    pair: tuple[Avatar, Subject], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A surface that lies a kilometre away in one piece is no nearer to any vertex than the reach of the search."""
+    avatar, subject = pair
+    known = _with_truth(avatar, subject, tmp_path / "truth.npz")
+    assert known.ground_truth is not None
+    away = np.load(known.ground_truth)["vertices"] + np.float32(1000.0)
+    known = _with_truth(avatar, subject, tmp_path / "truth.npz", vertices=away)
+    metrics = evaluate(avatar, known, avatar_path=Path("a.pt"), splits=("val",))
+    assert metrics["geometry"] is None
+    assert "no scored vertex lies within 100 m of the fitted surface" in metrics["geometry_reason"]
+    assert metrics["geometry_reason"] in caplog.text

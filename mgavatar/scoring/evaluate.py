@@ -1,4 +1,4 @@
-"""Scores of an avatar on a capture: images it has not seen, and geometry where the truth is known."""
+"""Scores of an avatar on a capture: images that the fit has not seen, and geometry where the truth is known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -18,17 +18,18 @@ from mgavatar.capture.subject import Frame, Split, Subject
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
 from mgavatar.head.params import HeadParams, Pose
-from mgavatar.losses import ssim
 from mgavatar.scoring.baselines import NaiveBaselines
-from mgavatar.scoring.geometry import score_geometry
-from mgavatar.scoring.image_metrics import psnr
+from mgavatar.scoring.geometry import REACH, score_geometry
+from mgavatar.scoring.image_metrics import image_metrics
 from mgavatar.scoring.lpips import NO_WEIGHTS, Lpips, load_lpips
+from mgavatar.scoring.truth import Truth, read_ground_truth
 
 T = TypeVar("T")
 Progress = Callable[[int, int], None]
 
 TASKS: dict[Split, str] = {"train": "training-views", "val": "novel-view", "test": "self-reenactment"}
 GEOMETRY_TIMESTEPS = 12
+NO_TRUTH = "the capture has no ground truth"
 
 log = logging.getLogger("mgavatar")
 
@@ -41,6 +42,7 @@ def evaluate(
     splits: Sequence[Split],
     lpips_weights: Path | None = None,
     max_frames: int | None = None,
+    bad_truth: Literal["refuse", "warn"] = "refuse",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Score an avatar on a capture; the result is ``metrics.json``.
@@ -51,21 +53,23 @@ def evaluate(
     Args:
         avatar: The avatar.
         subject: The capture; images of ``val`` and ``test`` that are in ``train`` too are left out with a warning.
-        avatar_path: Where the avatar comes from, for the record.
-        splits: What to score.
+        avatar_path: File of the avatar, for the record.
+        splits: Splits to score.
         lpips_weights: The state dict of ``lpips.LPIPS(net="vgg")``, or None.
-        max_frames: Score at most so many images of each split, spread over it; ``sampled_from`` then says of how many.
+        max_frames: Score at most so many images per split, spread over it; ``sampled_from`` then states their number.
+        bad_truth: Refuse ground truth that cannot be scored, or warn and leave the geometry out.
         progress: Called with the number of images scored and their total.
 
     Returns:
         ``avatar``, ``data``, ``device``; ``splits`` with ``psnr`` [dB], ``ssim``, ``lpips`` and, under ``naive``, the
-        PSNR [dB] of predictors that know nothing of heads; ``geometry`` or None; ``seconds_per_frame``, the median
-        time from pose to image. Splits without images are left out, and so are naive baselines that have nothing to
-        predict with.
+        PSNR [dB] of baselines that know nothing of heads; ``geometry``, or None with a ``geometry_reason``;
+        ``seconds_per_frame``, the median time from pose to image. Splits without images are left out, and so are
+        baselines that lack the images that they need.
 
     Raises:
         DataError: If no split has images that training has not seen, or a file is missing or damaged.
     """
+    truth, geometry_reason = _read_truth(subject, bad_truth)
     held_out = {split: _held_out(subject, split) for split in splits if subject.frames[split]}
     _warn_of_training_images(subject, held_out)
     frames = {split: spread(own, max_frames) for split, own in held_out.items() if own}
@@ -89,37 +93,73 @@ def evaluate(
         results[split] = _summary(split, chosen, scores, has_lpips=lpips is not None)
         if len(chosen) < len(held_out[split]):
             results[split]["sampled_from"] = len(held_out[split])
+    geometry = None
+    if truth is not None:
+        geometry, geometry_reason = _score_truth(avatar, subject, truth)
     return {
         "avatar": str(avatar_path),
         "data": str(subject.root),
         "device": str(avatar.device),
         "splits": results,
-        "geometry": score_geometry(avatar, subject, _geometry_poses(avatar, subject)),
+        "geometry": geometry,
+        "geometry_reason": geometry_reason,
         "seconds_per_frame": float(np.median(scorer.seconds)),
     }
 
 
 def evaluate_sample(avatar: Avatar, subject: Subject, *, avatar_path: Path, max_frames: int = 24) -> dict[str, Any]:
-    """A quick score after a fit: some of the held-out images, or of the training images if none are held out."""
+    """Score a fit that has just ended on some held-out images, or on training images if none are held out.
+
+    Ground truth that cannot be scored costs the score of the geometry and a warning, not the whole score.
+    """
     held_out: tuple[Split, ...] = tuple(split for split in ("val", "test") if _held_out(subject, split))
-    return evaluate(avatar, subject, avatar_path=avatar_path, splits=held_out or ("train",), max_frames=max_frames)
+    return evaluate(
+        avatar,
+        subject,
+        avatar_path=avatar_path,
+        splits=held_out or ("train",),
+        max_frames=max_frames,
+        bad_truth="warn",
+    )
+
+
+def _read_truth(subject: Subject, bad_truth: Literal["refuse", "warn"]) -> tuple[Truth | None, str | None]:
+    """Return the ground truth, or None and the reason for it."""
+    try:
+        truth = read_ground_truth(subject)
+    except DataError as error:
+        if bad_truth == "refuse":
+            raise
+        log.warning("geometry is not scored: %s", error)
+        return None, str(error)
+    return truth, NO_TRUTH if truth is None else None
+
+
+def _score_truth(avatar: Avatar, subject: Subject, truth: Truth) -> tuple[dict[str, Any] | None, str | None]:
+    """Return the scores of the geometry, or None and the reason for it."""
+    scores = score_geometry(avatar, subject, truth, _geometry_poses(avatar, subject))
+    if scores["mean_mm"] is not None:
+        return scores, None
+    reason = f"{subject.ground_truth}: no scored vertex lies within {REACH:.0f} m of the fitted surface"
+    log.warning("geometry is not scored: %s", reason)
+    return None, reason
 
 
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
-    """Write ``metrics.json``; atomic."""
+    """Write ``metrics.json``, whole or not at all."""
     with atomic_write(path) as file:
         file.write((json.dumps(metrics, indent=2) + "\n").encode())
 
 
 def spread(items: Sequence[T], count: int | None) -> tuple[T, ...]:
-    """At most ``count`` items, evenly spaced from the first to the last; all of them if None."""
+    """Pick at most ``count`` items, evenly spaced from the first to the last; all of them if None."""
     if count is None or len(items) <= count:
         return tuple(items)
     return tuple(items[index] for index in np.linspace(0, len(items) - 1, count).round().astype(int))
 
 
 def _held_out(subject: Subject, split: Split) -> tuple[Frame, ...]:
-    """The images of a split that training has not seen; all of them if it is the training split that is asked for."""
+    """Return the images of a split that are no training images; all images of the training split itself."""
     frames = subject.frames[split]
     if split == "train":
         return frames
@@ -139,7 +179,7 @@ def _warn_of_training_images(subject: Subject, held_out: dict[Split, tuple[Frame
 
 
 def is_own_capture(avatar: Avatar, subject: Subject) -> bool:
-    """Whether a capture is the one that the avatar was fitted to: the same timesteps with the same parameters."""
+    """Return True if the avatar was fitted to this capture: the same timesteps with the same parameters."""
     own = avatar.capture
     if own.timestep_ids != subject.timestep_ids:
         return False
@@ -151,14 +191,14 @@ def is_own_capture(avatar: Avatar, subject: Subject) -> bool:
 
 
 def evaluation_pose(avatar: Avatar, subject: Subject, timestep: int) -> Pose:
-    """The pose to score a timestep with: as refined where the fit has seen it, else as tracked."""
+    """Return the pose to score a timestep with: as refined where the fit has seen it, else as tracked."""
     if timestep in avatar.capture.train_timesteps and is_own_capture(avatar, subject):
         return avatar.head.pose(timestep)
     return subject.params.pose(timestep, n_expr=avatar.head_model.n_expr)
 
 
 def _geometry_poses(avatar: Avatar, subject: Subject) -> dict[int, Pose]:
-    """Up to twelve training timesteps, spread over them, in the poses that images are scored with."""
+    """Return the poses of up to twelve training timesteps, spread over the capture, as images are scored with them."""
     timesteps = sorted({frame.timestep for frame in subject.frames["train"]})
     return {t: evaluation_pose(avatar, subject, t) for t in spread(timesteps, GEOMETRY_TIMESTEPS)}
 
@@ -176,7 +216,7 @@ def _warn_of_cut_expression(avatar: Avatar, subject: Subject) -> None:
 
 
 class _Scorer:
-    """Scores one frame after the other and keeps the times."""
+    """Scores of single frames, and the times that drawing them took."""
 
     def __init__(self, avatar: Avatar, subject: Subject, lpips: Lpips | None) -> None:
         self.avatar, self.subject, self.lpips = avatar, subject, lpips
@@ -187,16 +227,10 @@ class _Scorer:
         pose = evaluation_pose(self.avatar, self.subject, frame.timestep)
         start = time.perf_counter()
         image = self.avatar.render(pose, frame.camera).image.clamp(0.0, 1.0)
-        on_cpu = image.cpu()  # waits for the device
+        image.cpu()  # waits for the device
         self.seconds.append(time.perf_counter() - start)
         target = read_images([frame], threads=1)[0].float() / 255.0
-        on_device = target.to(image.device)
-        return {
-            "psnr": psnr(on_cpu, target),
-            "ssim": float(ssim(image, on_device)),
-            "lpips": None if self.lpips is None else float(self.lpips(image, on_device)),
-            **self.naive.scores(frame, target),
-        }
+        return {**image_metrics(image, target.to(image.device), self.lpips), **self.naive.scores(frame, target)}
 
 
 def _summary(
@@ -217,6 +251,6 @@ def _summary(
 
 
 def _mean(scores: list[dict[str, float | None]], name: str) -> float | None:
-    """Mean over the images that have this score."""
+    """Return the mean over the images that have this score, or None."""
     values = [value for score in scores if (value := score[name]) is not None]
     return float(np.mean(values)) if values else None
