@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from mgavatar.config import FitConfig, GeometryConfig
 from mgavatar.driving.motion import read_driving
 from mgavatar.driving.writers import to_bytes
 from mgavatar.reporting.charts import loss_chart, read_history
-from mgavatar.reporting.page import config_changes, write_report
+from mgavatar.reporting.page import config_changes, templates, write_report
 from mgavatar.reporting.pictures import ERROR_GAIN, comparison, normal_picture, start_verts, strip
 from mgavatar.scoring.evaluate import evaluate_sample
 
@@ -71,15 +72,51 @@ def test_the_page_is_whole_and_self_contained(pair: tuple[Avatar, Subject], tmp_
 
 
 def test_a_page_without_scores_history_or_held_out_frames(tmp_path: Path) -> None:
-    """What is missing is said, and names from outside are not taken for HTML."""
+    """The page states what is missing."""
     avatar, subject = tiny_avatar(tmp_path, n_cameras=1, n_timesteps=2)
-    bare = replace(subject, frames={**subject.frames, "test": ()}, root=Path("<b>me&you"))
+    bare = replace(subject, frames={**subject.frames, "test": ()})
     text = write_report(tmp_path / "run", avatar, bare, None, history=tmp_path / "gone.jsonl").read_text("utf-8")
     assert "Not evaluated." in text
     assert "No history was found." in text
     assert "Training views: camera 0" in text
-    assert "me&amp;you" in text
-    assert "<b>me" not in text
+
+
+def test_names_from_outside_are_text(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
+    """A folder, a stage or a loss that is called like HTML appears as it is called, in text and in attributes."""
+    avatar, subject = pair
+    evil = replace(subject, root=Path("""<b>&"'"""))
+    line = {"stage": """<i>&"'""", "iteration": 1, "loss": 1.0, """<u>&"'""": 2.0}
+    history = tmp_path / "metrics.jsonl"
+    history.write_text(json.dumps(line) + "\n", "utf-8")
+    metrics = evaluate_sample(avatar, evil, avatar_path=tmp_path / "a.pt")
+    metrics["geometry_reason"] = """<s>&"'"""
+    text = write_report(tmp_path / "run", avatar, evil, metrics, history=history).read_text("utf-8")
+    page = _Page()
+    page.feed(text)
+    assert not {"i", "u", "s"} & page.tags
+    assert text.count("<b>") == text.count('<div class="card"><b>')
+    assert """<b>&"'""" in page.texts
+    assert """<i>&"'""" in page.texts
+    assert """<u>&"'""" in page.texts
+    assert """Geometry is not scored: <s>&"'.""" in page.texts
+    assert """<i>&"': losses by iteration""" in page.attributes
+
+
+class _Page(HTMLParser):
+    """A page as a browser reads it: names of its tags, texts, values of attributes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.texts: list[str] = []
+        self.attributes: list[str | None] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes += [value for _, value in attrs]
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data.strip())
 
 
 def test_geometry_and_truth_appear_where_they_are_known(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
@@ -92,8 +129,29 @@ def test_geometry_and_truth_appear_where_they_are_known(pair: tuple[Avatar, Subj
     metrics = evaluate_sample(avatar, known, avatar_path=tmp_path / "a.pt")
     text = write_report(tmp_path / "run", avatar, known, metrics, history=tmp_path / "gone").read_text("utf-8")
     assert "<span>truth</span>" in text
+    assert "Geometry is not scored" not in text
     for cell in ("true surface to mesh", "<td>left</td>", "<td>right</td>", "<td>+ pose offsets</td>", "new crossings"):
         assert cell in text
+
+
+def test_truth_that_cannot_be_read_costs_its_picture_only(
+    pair: tuple[Avatar, Subject], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A file that was damaged while the fit ran: the score and the page are there, and both say what is missing."""
+    avatar, subject = pair
+    path = tmp_path / "truth.npz"
+    path.write_bytes(b"cut off")
+    damaged = replace(subject, ground_truth=path)
+    metrics = evaluate_sample(avatar, damaged, avatar_path=tmp_path / "a.pt")
+    text = write_report(tmp_path / "run", avatar, damaged, metrics, history=tmp_path / "gone").read_text("utf-8")
+    assert metrics["splits"]["val"]["psnr"] > 0
+    assert f"Geometry is not scored: {path}: not a readable .npz file" in text
+    assert "<span>truth</span>" not in text
+    warnings = [record.message for record in caplog.records if record.levelname == "WARNING"]
+    assert [warning.partition(":")[0] for warning in warnings if str(path) in warning] == [
+        "geometry is not scored",
+        "the report shows no ground truth",
+    ]
 
 
 def test_comparison_shows_capture_avatar_and_amplified_error(pair: tuple[Avatar, Subject]) -> None:
@@ -173,17 +231,35 @@ def test_history_survives_a_killed_and_resumed_fit(tmp_path: Path) -> None:
     assert read_history(tmp_path / "gone.jsonl") == {}
 
 
+def _drawn(lines: list[dict[str, Any]], title: str) -> str:
+    return templates().get_template("chart.svg.j2").render(chart=loss_chart(lines, title=title))
+
+
 def test_loss_chart_draws_each_positive_term() -> None:
     lines = [
         {"iteration": i, "loss": 10.0 ** -(i / 50), "zero": 0.0, "bad": float("nan"), "x<y": 0.1} for i in range(1, 101)
     ]
-    svg = loss_chart(lines, title="a & b")
+    svg = _drawn(lines, "a & b")
     assert svg.count("<polyline") == 2
     for text in ("a &amp; b", "x&lt;y", "iteration", "loss (log scale)", ">0.01<", ">100<"):
         assert text in svg
-    places = [tuple(map(float, pair.split(","))) for pair in re.findall(r'points="([^"]*)"', svg)[0].split()]
-    heights = [y for _, y in places]
+    heights = _heights(svg)
     assert heights == sorted(heights)  # a falling loss goes down
     assert min(heights) >= 30
     assert max(heights) <= 260 - 44
-    assert "no losses were logged" in loss_chart([{"iteration": 1}], title="t")
+    assert "no losses were logged" in _drawn([{"iteration": 1}], "t")
+
+
+def test_losses_of_many_decades_stay_inside_the_chart() -> None:
+    """Six decades are drawn; what is smaller lies on the axis."""
+    lines = [{"iteration": i, "loss": 10.0**-i} for i in range(1, 31)]
+    heights = _heights(_drawn(lines, "t"))
+    assert min(heights) >= 30
+    assert max(heights) == 260 - 44
+    assert len(set(heights)) < len(heights)
+
+
+def _heights(svg: str) -> list[float]:
+    """Heights of the first curve's points, downwards [px]."""
+    points = re.findall(r'points="([^"]*)"', svg)[0].split()
+    return [float(point.split(",")[1]) for point in points]

@@ -1,11 +1,11 @@
-"""Loss curves as inline SVG: no scripts, colours from the page."""
+"""Loss curves: what ``chart.svg.j2`` draws, as numbers in the units of its drawing."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,55 @@ COLORS = ("var(--c1)", "var(--c2)", "var(--c3)", "var(--c4)", "var(--c5)", "var(
 """Custom properties that the page defines for light and dark."""
 
 _WIDTH, _HEIGHT = 560, 260
-_LEFT, _RIGHT, _TOP, _BOTTOM = 62, 12, 30, 44
+_LEFT, _RIGHT, _TOP, _BOTTOM = 62, _WIDTH - 12, 30, _HEIGHT - 44
 _POINTS = 160
+_LETTER = 7
+"""Width of a letter of the legend, roughly."""
 _NOT_LOSSES = frozenset({"iteration", "stage", "gaussians", "seconds"})
 
 Line = Mapping[str, Any]
 
 
-def read_history(path: Path) -> dict[str, list[Line]]:
-    """Lines of ``metrics.jsonl`` by stage, in the order of their iterations.
+@dataclass(frozen=True)
+class Tick:
+    """A labelled place on an axis."""
 
-    A line that was cut off when a fit was killed is left out; of an iteration that was done twice, after a resume, the
-    last one counts. A missing file is an empty history.
+    at: float
+    label: str
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One term of a loss: the points of a polyline, its colour, and where its name stands in the legend."""
+
+    name: str
+    points: str
+    color: str
+    legend_x: int
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Losses of a stage by iteration, on a logarithmic axis; without curves if nothing was logged."""
+
+    title: str
+    caption: str
+    curves: tuple[Curve, ...] = ()
+    x_ticks: tuple[Tick, ...] = ()
+    y_ticks: tuple[Tick, ...] = ()
+    width: int = _WIDTH
+    height: int = _HEIGHT
+    left: int = _LEFT
+    right: int = _RIGHT
+    top: int = _TOP
+    bottom: int = _BOTTOM
+
+
+def read_history(path: Path) -> dict[str, list[Line]]:
+    """Read the lines of ``metrics.jsonl`` by stage, in the order of their iterations.
+
+    A line that was cut off when a fit was killed is left out. An iteration that was done twice, because a fit was
+    resumed, counts as it was done last. A missing file is an empty history.
     """
     stages: dict[str, dict[int, Line]] = {}
     if not path.is_file():
@@ -40,101 +77,85 @@ def read_history(path: Path) -> dict[str, list[Line]]:
     return {stage: [lines[iteration] for iteration in sorted(lines)] for stage, lines in stages.items()}
 
 
-def loss_chart(lines: Sequence[Line], *, title: str) -> str:
-    """Every positive term of a stage's loss over its iterations, on a logarithmic axis.
+def loss_chart(lines: Sequence[Line], *, title: str, caption: str = "") -> Chart:
+    """Chart every positive term of a stage's loss.
 
     Each point is the mean over a stretch of iterations, because single images differ more than the loss falls.
 
     Args:
         lines: History of one stage.
         title: Stands above the chart.
-
-    Returns:
-        An ``<svg>`` element, or a paragraph if there is nothing to draw.
+        caption: Stands below it.
     """
-    curves = {name: curve for name in _terms(lines) if len(curve := _curve(lines, name))}
-    if not curves:
-        return f"<p>{escape(title)}: no losses were logged.</p>"
-    last = max(float(line["iteration"]) for line in lines)
-    values = np.concatenate([curve[:, 1] for curve in curves.values()])
-    low, high = _decades(values)
+    terms = {name: curve for name in _terms(lines) if len(curve := _curve(lines, name))}
+    if not terms:
+        return Chart(title, caption)
+    last = max(1.0, *(float(line["iteration"]) for line in lines))
+    low, high = _decades(np.concatenate([curve[:, 1] for curve in terms.values()]))
 
-    def place(x: float, y: float) -> tuple[float, float]:
-        across = (_WIDTH - _LEFT - _RIGHT) * x / max(last, 1.0)
-        down = (_HEIGHT - _TOP - _BOTTOM) * (high - math.log10(y)) / (high - low)
-        return _LEFT + across, _TOP + down
+    def across(iteration: float) -> float:
+        return round(_LEFT + (_RIGHT - _LEFT) * iteration / last, 1)
 
-    parts = [*_grid(place, last, low, high), *_axis_labels()]
-    for index, (name, curve) in enumerate(curves.items()):
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (place(*row) for row in curve.tolist()))
-        color = COLORS[index % len(COLORS)]
-        width = 2.2 if name == "loss" else 1.4
-        parts.append(f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="{width}"/>')
-    parts.append(_legend(list(curves)))
-    label = escape(f"{title}: losses by iteration")
-    return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{label}">'
-        f'<text x="{_LEFT}" y="16" class="title">{escape(title)}</text>{"".join(parts)}</svg>'
+    def down(loss: float) -> float:
+        decades = high - math.log10(max(loss, 10.0**low))
+        return round(_TOP + (_BOTTOM - _TOP) * decades / (high - low), 1)
+
+    curves = []
+    for (name, curve), color, x in zip(terms.items(), _colors(len(terms)), _legend(list(terms)), strict=True):
+        points = " ".join(f"{across(iteration)},{down(loss)}" for iteration, loss in curve.tolist())
+        curves.append(Curve(name, points, color, x))
+    return Chart(
+        title,
+        caption,
+        curves=tuple(curves),
+        x_ticks=tuple(Tick(across(tick), f"{tick:,.0f}") for tick in _ticks(last)),
+        y_ticks=tuple(Tick(down(10.0**power), f"{10.0**power:g}") for power in range(low, high + 1)),
     )
 
 
 def _terms(lines: Sequence[Line]) -> list[str]:
-    """Names of the numbers that were logged; what all stages have comes first, and so has the same colour in all."""
+    """Return the names of the numbers that were logged.
+
+    Terms that all stages have come first, so they have the same colours in all charts.
+    """
     names = {name for line in lines for name, value in line.items() if isinstance(value, int | float)}
     return sorted(names - _NOT_LOSSES, key=lambda name: (name != "loss", name != "image", name))
 
 
 def _curve(lines: Sequence[Line], name: str) -> np.ndarray:
-    """Iterations and means of a term over equal stretches, positive ones only, shape [P, 2]."""
+    """Return iterations and means of a term over equal stretches, without those that a log axis lacks; [P, 2]."""
     rows = [(float(line["iteration"]), float(line[name])) for line in lines if isinstance(line.get(name), int | float)]
-    chunks = np.array_split(np.array(rows).reshape(-1, 2), max(1, min(_POINTS, max(len(rows) // 4, 20))))
-    points = [chunk.mean(axis=0) for chunk in chunks if len(chunk)]
-    good = [point for point in points if np.isfinite(point).all() and point[1] > 0]
-    return np.array(good).reshape(-1, 2)
+    n_points = min(_POINTS, max(len(rows) // 4, 20))
+    stretches = np.array_split(np.array(rows).reshape(-1, 2), n_points)
+    points = [stretch.mean(axis=0) for stretch in stretches if len(stretch)]
+    drawn = [point for point in points if np.isfinite(point).all() and point[1] > 0]
+    return np.array(drawn).reshape(-1, 2)
 
 
 def _decades(values: np.ndarray) -> tuple[int, int]:
-    """Whole powers of ten around the values, at most six of them: what is smaller is cut."""
+    """Return the whole powers of ten around the values, at most six of them."""
     high = math.ceil(math.log10(float(values.max())) + 1e-9)
     low = math.floor(math.log10(float(values.min())))
     return max(min(low, high - 1), high - 6), high
 
 
-def _grid(place: Any, last: float, low: int, high: int) -> list[str]:
-    parts = []
-    for power in range(low, high + 1):
-        x, y = place(0.0, 10.0**power)
-        parts.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{_WIDTH - _RIGHT}" y2="{y:.1f}" class="grid"/>')
-        parts.append(f'<text x="{x - 6:.1f}" y="{y + 4:.1f}" text-anchor="end">{10.0**power:g}</text>')
-    for tick in _ticks(last):
-        x, y = place(tick, 10.0**low)
-        parts.append(f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x:.1f}" y2="{y + 4:.1f}" class="axis"/>')
-        parts.append(f'<text x="{x:.1f}" y="{y + 17:.1f}" text-anchor="middle">{tick:,.0f}</text>')
-    return parts
-
-
 def _ticks(last: float) -> list[float]:
-    """About five round numbers from 0 to ``last``."""
-    rough = max(last, 1.0) / 5
+    """Return about five round numbers from 0 to ``last``."""
+    rough = last / 5
     power = 10.0 ** math.floor(math.log10(rough))
     step = max(1.0, next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough))
     return [step * index for index in range(int(last / step) + 1)]
 
 
-def _axis_labels() -> list[str]:
-    middle = (_TOP + _HEIGHT - _BOTTOM) / 2
-    return [
-        f'<text x="{(_LEFT + _WIDTH - _RIGHT) / 2}" y="{_HEIGHT - 6}" text-anchor="middle">iteration</text>',
-        f'<text transform="translate(14 {middle}) rotate(-90)" text-anchor="middle">loss (log scale)</text>',
-    ]
+def _colors(count: int) -> list[str]:
+    return [COLORS[index % len(COLORS)] for index in range(count)]
 
 
-def _legend(names: Sequence[str]) -> str:
-    parts = []
-    x = _WIDTH - _RIGHT
-    for index in reversed(range(len(names))):
-        x -= 7 * len(names[index]) + 30
-        color = COLORS[index % len(COLORS)]
-        parts.append(f'<line x1="{x}" y1="12" x2="{x + 16}" y2="12" stroke="{color}" stroke-width="3"/>')
-        parts.append(f'<text x="{x + 20}" y="16">{escape(names[index])}</text>')
-    return "".join(parts)
+def _legend(names: Sequence[str]) -> list[int]:
+    """Return where each name begins, so that the last one ends at the right edge."""
+    starts = []
+    x = _RIGHT
+    for name in reversed(names):
+        x -= _LETTER * len(name) + 30
+        starts.append(x)
+    return starts[::-1]
