@@ -1,4 +1,4 @@
-"""What is installed: every folder, the presets, one name for the kernels, and only declared dependencies."""
+"""The installed package: every folder and data file, one name for the kernels, and dependencies that are used."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import ast
 import importlib.metadata
 import importlib.util
 import re
+import shutil
+import subprocess
 import sys
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from importlib import resources
@@ -19,13 +22,31 @@ import mgavatar
 from mgavatar import cli
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-DISTRIBUTION_OF = {"warp": "warp-lang", "PIL": "Pillow", "kornia_rs": "kornia", "pxr": "usd-core"}
-"""Where the name to import is not the name to install; kornia brings kornia_rs along."""
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+REQUIRED = PROJECT["project"]["dependencies"]
+EXTRAS = PROJECT["project"]["optional-dependencies"]
+DISTRIBUTION_OF = {"warp": "warp-lang", "PIL": "Pillow", "kornia_rs": "kornia-rs"}
+"""Names to install, where they differ from the names to import."""
+
+POSIX_ONLY = {
+    "crypt",
+    "curses",
+    "fcntl",
+    "grp",
+    "posix",
+    "pty",
+    "pwd",
+    "readline",
+    "resource",
+    "syslog",
+    "termios",
+    "tty",
+}
+"""Modules of Python's that Windows lacks."""
 
 
 def source_files() -> dict[str, Path]:
-    """Every module that is installed, by its name."""
+    """Return the file of every installed module, by the module's name."""
     folders = {
         "mgavatar": ROOT / "mgavatar",
         "mgavatar.kernels": ROOT / "kernels",
@@ -46,8 +67,8 @@ MODULES = source_files()
 
 
 def imports(path: Path, *, lazy: bool) -> Iterator[str]:
-    """Modules that a file imports; without ``lazy``, only those that importing it imports."""
-    nodes: list[ast.AST] = [ast.parse(path.read_text())]
+    """Yield the modules that a file imports; without ``lazy``, only those that importing it imports."""
+    nodes: list[ast.AST] = [ast.parse(path.read_text("utf-8"))]
     while nodes:
         node = nodes.pop()
         if isinstance(node, ast.Import):
@@ -84,8 +105,8 @@ def test_where_the_packages_come_from():
         "mgavatar.configs": "configs",
     }
     link = ROOT / "mgavatar" / "kernels"
-    assert link.is_symlink()
-    assert link.resolve() == ROOT / "kernels"
+    # Git for Windows writes a link as a text file unless it is told otherwise; installing works all the same.
+    assert (link.readlink() if link.is_symlink() else Path(link.read_text("utf-8"))) == Path("../kernels")
 
 
 def test_kernels_have_one_name():
@@ -97,12 +118,38 @@ def test_kernels_have_one_name():
     assert "kernels" not in sys.modules
 
 
-def test_the_presets_and_the_type_marker_ship():
-    """As data of their packages, in every way of installing."""
-    shipped = {file.name for file in resources.files("mgavatar.configs").iterdir()}
-    assert {path.name for path in (ROOT / "configs").glob("*.toml")} <= shipped
+def test_the_installed_package_has_its_data():
+    """Presets, the report's templates and the type marker are there in every way of installing."""
+    assert PROJECT["tool"]["setuptools"]["package-data"] == {
+        "mgavatar.configs": ["*.toml"],
+        "mgavatar": ["py.typed"],
+        "mgavatar.reporting": ["*.j2"],
+    }
+    for package, folder in (("mgavatar.configs", "configs"), ("mgavatar.reporting", "mgavatar/reporting")):
+        shipped = {file.name for file in resources.files(package).iterdir()}
+        assert {path.name for path in (ROOT / folder).iterdir() if path.suffix in (".toml", ".j2")} <= shipped
     assert (resources.files("mgavatar") / "py.typed").is_file()
-    assert PROJECT["tool"]["setuptools"]["package-data"] == {"mgavatar.configs": ["*.toml"], "mgavatar": ["py.typed"]}
+
+
+def test_the_wheel_is_complete(tmp_path):
+    """It holds every module and data file and nothing else, also if it is built from a checkout without links."""
+    for folder in ("mgavatar", "kernels", "configs"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("kernels", "__pycache__"))
+    (tmp_path / "mgavatar" / "kernels").write_text("../kernels", "utf-8")
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / file, tmp_path)
+    build = "import setuptools.build_meta as backend; backend.build_wheel('dist')"
+    subprocess.run([sys.executable, "-c", build], cwd=tmp_path, check=True, capture_output=True)
+    (wheel,) = (tmp_path / "dist").iterdir()
+    with zipfile.ZipFile(wheel) as archive:
+        shipped = {name for name in archive.namelist() if ".dist-info/" not in name}
+    modules = {
+        "/".join([*name.split("."), *(["__init__"] if path.name == "__init__.py" else [])]) + ".py"
+        for name, path in MODULES.items()
+    }
+    presets = {f"mgavatar/configs/{path.name}" for path in (ROOT / "configs").glob("*.toml")}
+    templates = {"mgavatar/reporting/page.html.j2", "mgavatar/reporting/chart.svg.j2"}
+    assert shipped == modules | presets | templates | {"mgavatar/py.typed"}
 
 
 def test_the_version_is_said_once():
@@ -117,25 +164,83 @@ def test_the_command_is_the_command_line():
     assert entry.load() is cli.main
 
 
-def test_the_extras():
-    """What is optional is named by what it is for."""
-    assert set(PROJECT["project"]["optional-dependencies"]) == {"viewer", "video", "track", "usd", "fleet", "dev"}
+def names(requirements: list[str]) -> set[str]:
+    """Return the names of the distributions that are required."""
+    return {re.split(r"[<>=!~\[ ;]", requirement)[0].lower() for requirement in requirements}
+
+
+def imported_distributions(*, lazy: bool) -> dict[str, set[str]]:
+    """Return the modules that import each distribution of other people's."""
+    found: dict[str, set[str]] = {}
+    for name, path in MODULES.items():
+        for imported in imports(path, lazy=lazy):
+            top = imported.partition(".")[0]
+            if top not in sys.stdlib_module_names and top not in ("mgavatar", "__future__"):
+                found.setdefault(DISTRIBUTION_OF.get(top, top).lower(), set()).add(name)
+    return found
 
 
 def test_only_declared_dependencies_are_imported():
-    """Whatever is imported is of Python, of the project, or in pyproject.toml; extras only where they are used."""
+    """Whatever is imported is Python's, the project's, or in pyproject.toml; extras only inside functions."""
+    users = {name: requirements for name, requirements in EXTRAS.items() if name != "dev"}
+    optional = names([requirement for extra in users.values() for requirement in extra])
+    for lazy, allowed in ((False, names(REQUIRED)), (True, names(REQUIRED) | optional)):
+        for distribution, modules in imported_distributions(lazy=lazy).items():
+            assert distribution in allowed, f"{distribution} is imported by {modules}"
 
-    def names(requirements: list[str]) -> set[str]:
-        return {re.split(r"[<>=!~\[ ;]", requirement)[0].lower() for requirement in requirements}
 
-    required = names(PROJECT["project"]["dependencies"])
-    optional = names([r for extra in PROJECT["project"]["optional-dependencies"].values() for r in extra])
+def test_no_dependency_and_no_extra_without_code_behind_it():
+    """Whatever a user has to install is imported somewhere in the package."""
+    imported = set(imported_distributions(lazy=True))
+    assert set(EXTRAS) == {"video", "dev"}
+    for requirements in (REQUIRED, *(extra for name, extra in EXTRAS.items() if name != "dev")):
+        assert names(requirements) <= imported
+
+
+def test_importing_needs_nothing_that_windows_lacks():
+    """Modules that only POSIX has are imported where they are used, with another way out."""
     for name, path in MODULES.items():
-        for lazy, allowed in ((False, required), (True, required | optional)):
-            for imported in imports(path, lazy=lazy):
-                top = imported.partition(".")[0]
-                if top not in sys.stdlib_module_names and top not in ("mgavatar", "__future__"):
-                    assert DISTRIBUTION_OF.get(top, top).lower() in allowed, f"{name} imports {top}"
+        assert not POSIX_ONLY & set(imports(path, lazy=False)), name
+
+
+def test_text_files_have_an_encoding():
+    """Without one, Windows reads and writes text in the code page of its user's country."""
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call):
+                assert not lacks_encoding(node), f"{name}, line {node.lineno}: {ast.unparse(node)}"
+
+
+def lacks_encoding(call: ast.Call) -> bool:
+    """Return True for ``read_text()``, ``write_text(text)`` and ``open()`` of a text file, without an encoding."""
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    if any(keyword.arg == "encoding" for keyword in call.keywords):
+        return False
+    if name in ("read_text", "write_text"):
+        return len(call.args) < (1 if name == "read_text" else 2)
+    of_path = isinstance(call.func, ast.Attribute)
+    if name != "open" or (of_path and ast.unparse(call.func.value) in ("Image", "av", "archive", "os")):
+        return False
+    modes = call.args[0 if of_path else 1 :][:1] + [word.value for word in call.keywords if word.arg == "mode"]
+    return not any(isinstance(mode, ast.Constant) and "b" in str(mode.value) for mode in modes)
+
+
+def test_a_missing_encoding_is_found():
+    """The search above sees what it is for."""
+    for code, missing in (
+        ("p.read_text()", True),
+        ("p.read_text('utf-8')", False),
+        ("p.write_text(t)", True),
+        ("p.write_text(t, encoding='utf-8')", False),
+        ("p.open()", True),
+        ("p.open('a', encoding='utf-8')", False),
+        ("p.open('rb')", False),
+        ("open(p, 'w')", True),
+        ("open(p, mode='xb')", False),
+        ("Image.open(p)", False),
+    ):
+        (call,) = (node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call))
+        assert lacks_encoding(call) is missing, code
 
 
 def test_imports_point_one_way():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -20,15 +19,15 @@ class Summary:
 
     Attributes:
         seconds: Of the fit before this process.
-        peak_mib: Peak memory before this process [MiB].
+        peak_mib: Peak memory before this process [MiB], or None where the system does not tell.
         stages: Iterations, configured iterations and seconds of each stage so far.
     """
 
     def __init__(self, before: dict[str, Any] | None = None, *, clock: Callable[[], float] = time.monotonic) -> None:
         """Start, or go on from the ``state`` in a checkpoint."""
-        before = before or {"seconds": 0.0, "peak_mib": 0.0, "stages": {}}
+        before = before or {"seconds": 0.0, "peak_mib": None, "stages": {}}
         self.seconds: float = before["seconds"]
-        self.peak_mib: float = before["peak_mib"]
+        self.peak_mib: float | None = before["peak_mib"]
         self.stages: dict[str, dict[str, Any]] = {name: dict(stage) for name, stage in before["stages"].items()}
         self.clock = clock
         self.started = clock()
@@ -49,9 +48,10 @@ class Summary:
 
     def state(self) -> dict[str, Any]:
         """What a checkpoint keeps."""
+        peaks = [peak for peak in (self.peak_mib, peak_mib()) if peak is not None]
         return {
             "seconds": round(self.seconds + self.clock() - self.started, 3),
-            "peak_mib": max(self.peak_mib, peak_mib()),
+            "peak_mib": max(peaks, default=None),
             "stages": self.stages,
         }
 
@@ -64,7 +64,11 @@ class Summary:
             file.write((json.dumps(table, indent=2) + "\n").encode())
 
 
-def peak_mib() -> float:
-    """Most memory that this process has held [MiB]."""
+def peak_mib() -> float | None:
+    """Return the most memory that this process has held [MiB], or None where Python cannot tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
