@@ -205,10 +205,10 @@ def test_importing_needs_nothing_that_windows_lacks():
 
 def test_text_files_have_an_encoding():
     """Without one, Windows reads and writes text in the code page of its user's country."""
-    for name, path in MODULES.items():
+    for path in (*MODULES.values(), *(ROOT / "tools").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call):
-                assert not lacks_encoding(node), f"{name}, line {node.lineno}: {ast.unparse(node)}"
+                assert not lacks_encoding(node), f"{path}, line {node.lineno}: {ast.unparse(node)}"
 
 
 def lacks_encoding(call: ast.Call) -> bool:
