@@ -76,7 +76,9 @@ def device_name(device: torch.device) -> str:
     info = Path("/proc/cpuinfo")
     if info.is_file():
         names = [
-            line.split(":", 1)[1].strip() for line in info.read_text("utf-8").splitlines() if line.startswith("model name")
+            line.split(":", 1)[1].strip()
+            for line in info.read_text("utf-8").splitlines()
+            if line.startswith("model name")
         ]
         model = names[0] if names else model
     return f"{model}, {os.cpu_count()} cores"
