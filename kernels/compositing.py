@@ -73,8 +73,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         splats: wp.array2d[real],  # [N, 16] projection.SPLAT
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
-        items: wp.array[wp.int32],  # [M]
-        item_splat: wp.array[wp.int32],  # [M]
+        isect_ids: wp.array[wp.int32],  # [M] intersections by tile, front to back
+        gaussian_ids: wp.array[wp.int32],  # [M] by intersection
         background: wp.array2d[real],  # [B, 3]
         n_columns: int,
         tiles_per_view: int,
@@ -83,10 +83,10 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         cap: real,
         # Out:
         image: wp.array4d[real],  # [B, 3, H, W]
-        coverage: wp.array3d[real],  # [B, H, W]
+        alphas: wp.array3d[real],  # [B, H, W]
         depths: wp.array3d[real],  # [B, H, W] sum of weight times depth
         final_T: wp.array3d[real],  # [B, H, W]
-        last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
+        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of isect_ids blended last, -1 if none
     ):
         thread = wp.tid()
         tile = thread // BLOCK
@@ -101,7 +101,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         accepted = wp.int32(-1)
         for k in range(tile_begin[tile], tile_end[tile]):
             if T >= stop:
-                n = item_splat[items[k]]
+                n = gaussian_ids[isect_ids[k]]
                 alpha = wp.min(cap, splats[n, 7] * gaussian(splats, n, offset(splats, n, x, y)))
                 if alpha >= alpha_threshold:
                     weight = alpha * T
@@ -114,10 +114,10 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         image[b, 0, y, x] = red + T * background[b, 0]
         image[b, 1, y, x] = green + T * background[b, 1]
         image[b, 2, y, x] = blue + T * background[b, 2]
-        coverage[b, y, x] = real(1.0) - T
+        alphas[b, y, x] = real(1.0) - T
         depths[b, y, x] = depth
         final_T[b, y, x] = T
-        last[b, y, x] = accepted
+        last_ids[b, y, x] = accepted
 
     @wp.kernel(module=module, enable_backward=False)
     def composite_bwd_kernel(
@@ -125,17 +125,17 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         splats: wp.array2d[real],  # [N, 16]
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
-        items: wp.array[wp.int32],  # [M]
-        item_splat: wp.array[wp.int32],  # [M]
+        isect_ids: wp.array[wp.int32],  # [M]
+        gaussian_ids: wp.array[wp.int32],  # [M]
         background: wp.array2d[real],  # [B, 3]
         n_columns: int,
         tiles_per_view: int,
         alpha_threshold: real,
         cap: real,
         final_T: wp.array3d[real],  # [B, H, W]
-        last: wp.array3d[wp.int32],  # [B, H, W]
+        last_ids: wp.array3d[wp.int32],  # [B, H, W]
         v_image: wp.array4d[real],  # [B, 3, H, W]
-        v_coverage: wp.array3d[real],  # [B, H, W]
+        v_alphas: wp.array3d[real],  # [B, H, W]
         v_depths: wp.array3d[real],  # [B, H, W]
         # Out:
         partials: wp.array2d[real],  # [M, 10] zero at first
@@ -156,13 +156,13 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             v_blue = v_image[b, 2, y, x]
             v_depth = v_depths[b, y, x]
             behind = (
-                v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_coverage[b, y, x]
+                v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_alphas[b, y, x]
             )
-            accepted = last[b, y, x]
+            accepted = last_ids[b, y, x]
         # Every thread of the block walks the same entries: the block sums need all of them.
         for step in range(tile_end[tile] - tile_begin[tile]):
             k = tile_end[tile] - 1 - step
-            n = item_splat[items[k]]
+            n = gaussian_ids[isect_ids[k]]
             active = bool(False)
             grad = row10()
             if k <= accepted:
@@ -191,7 +191,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
                         grad[3] = v_log * au * d[1]
                         grad[4] = real(-0.5) * v_log * d[1] * d[1]
                         grad[5] = G * v_alpha
-            block_sum(active, grad, items[k], lane, partials)
+            block_sum(active, grad, isect_ids[k], lane, partials)
 
     return composite_kernel, composite_bwd_kernel
 

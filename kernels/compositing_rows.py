@@ -121,7 +121,7 @@ _FORWARD = (
             for (int i = LANES; i < SIZE; i += LANES) open = most(open, *(const vf*)&T[i]);
             if (__builtin_reduce_max(open) < stop) break;
         }
-        const float* s = &splats.data[16LL * item_splat.data[items.data[k]]];
+        const float* s = &splats.data[16LL * gaussian_ids.data[isect_ids.data[k]]];
 """
     + _ROWS.replace("OPEN", "*(const vf*)&T[i] >= stop")
     + """
@@ -151,10 +151,10 @@ _FORWARD = (
             pixels[o] = red[i] + T[i] * b0;
             pixels[plane + o] = green[i] + T[i] * b1;
             pixels[2 * plane + o] = blue[i] + T[i] * b2;
-            coverage.data[start + o] = 1.0f - T[i];
+            alphas.data[start + o] = 1.0f - T[i];
             depths.data[start + o] = depth[i];
             final_T.data[start + o] = T[i];
-            last.data[start + o] = accepted[i];
+            last_ids.data[start + o] = accepted[i];
         }
 #endif
 """
@@ -187,8 +187,8 @@ _BACKWARD = (
             v_green[i] = v_pixels[plane + o];
             v_blue[i] = v_pixels[2 * plane + o];
             v_depth[i] = v_depths.data[start + o];
-            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_coverage.data[start + o];
-            accepted[i] = last.data[start + o];
+            behind[i] = v_red[i] * b0 + v_green[i] * b1 + v_blue[i] * b2 - v_alphas.data[start + o];
+            accepted[i] = last_ids.data[start + o];
             furthest = accepted[i] > furthest ? accepted[i] : furthest;
         }
     auto sum = [](vf v) -> float {
@@ -197,13 +197,13 @@ _BACKWARD = (
         return (half[0] + half[2]) + (half[1] + half[3]);
     };
     for (int k = end - 1; k >= begin; --k) {
-        const int item = items.data[k];
-        float* out = &partials.data[10LL * item];
+        const int isect = isect_ids.data[k];
+        float* out = &partials.data[10LL * isect];
         if (k > furthest) {  // hidden in all of the tile
             for (int c = 0; c < 10; ++c) out[c] = 0.0f;
             continue;
         }
-        const float* s = &splats.data[16LL * item_splat.data[item]];
+        const float* s = &splats.data[16LL * gaussian_ids.data[isect]];
         // Moments of h = G dL/dalpha over the pixels, in u and dy; the parameters' gradients are made of them.
         vf h0 = 0.0f, hu = 0.0f, hy = 0.0f, huu = 0.0f, huy = 0.0f, hyy = 0.0f;
         vf c0 = 0.0f, c1 = 0.0f, c2 = 0.0f, c3 = 0.0f;
@@ -260,19 +260,19 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.func_native(_FORWARD.replace("EXP2", _EXP2[exp]))
     def composite_tile(
         tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-        items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
-        width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
-        image: wp.array4d[wp.float32], coverage: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
-        final_T: wp.array3d[wp.float32], last: wp.array3d[wp.int32],
+        isect_ids: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32], background: wp.array2d[wp.float32],
+        n_columns: int, width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
+        image: wp.array4d[wp.float32], alphas: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
+        final_T: wp.array3d[wp.float32], last_ids: wp.array3d[wp.int32],
     ): ...  # fmt: skip
 
     @wp.func_native(_BACKWARD.replace("EXP2", _EXP2[exp]))
     def composite_tile_bwd(
         tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-        items: wp.array[wp.int32], item_splat: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int,
-        width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32, final_T: wp.array3d[wp.float32],
-        last: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32], v_coverage: wp.array3d[wp.float32],
-        v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
+        isect_ids: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32], background: wp.array2d[wp.float32],
+        n_columns: int, width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32,
+        final_T: wp.array3d[wp.float32], last_ids: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32],
+        v_alphas: wp.array3d[wp.float32], v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
     ): ...  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
@@ -282,8 +282,8 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
         splats: wp.array2d[wp.float32],  # [N, 16] projection.SPLAT
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
-        items: wp.array[wp.int32],  # [M]
-        item_splat: wp.array[wp.int32],  # [M]
+        isect_ids: wp.array[wp.int32],  # [M]
+        gaussian_ids: wp.array[wp.int32],  # [M]
         background: wp.array2d[wp.float32],  # [B, 3]
         n_columns: int,
         alpha_threshold: wp.float32,
@@ -291,14 +291,14 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
         cap: wp.float32,
         # Out:
         image: wp.array4d[wp.float32],  # [B, 3, H, W]
-        coverage: wp.array3d[wp.float32],  # [B, H, W]
+        alphas: wp.array3d[wp.float32],  # [B, H, W]
         depths: wp.array3d[wp.float32],  # [B, H, W] sum of weight times depth
         final_T: wp.array3d[wp.float32],  # [B, H, W]
-        last: wp.array3d[wp.int32],  # [B, H, W] entry of items last accepted, -1 if none
+        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of isect_ids blended last, -1 if none
     ):
         composite_tile(
-            first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-            image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, coverage, depths, final_T, last,
+            first + wp.tid(), splats, tile_begin, tile_end, isect_ids, gaussian_ids, background, n_columns,
+            image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, alphas, depths, final_T, last_ids,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
@@ -308,23 +308,23 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
         splats: wp.array2d[wp.float32],  # [N, 16]
         tile_begin: wp.array[wp.int32],  # [T]
         tile_end: wp.array[wp.int32],  # [T]
-        items: wp.array[wp.int32],  # [M]
-        item_splat: wp.array[wp.int32],  # [M]
+        isect_ids: wp.array[wp.int32],  # [M]
+        gaussian_ids: wp.array[wp.int32],  # [M]
         background: wp.array2d[wp.float32],  # [B, 3]
         n_columns: int,
         alpha_threshold: wp.float32,
         cap: wp.float32,
         final_T: wp.array3d[wp.float32],  # [B, H, W]
-        last: wp.array3d[wp.int32],  # [B, H, W]
+        last_ids: wp.array3d[wp.int32],  # [B, H, W]
         v_image: wp.array4d[wp.float32],  # [B, 3, H, W]
-        v_coverage: wp.array3d[wp.float32],  # [B, H, W]
+        v_alphas: wp.array3d[wp.float32],  # [B, H, W]
         v_depths: wp.array3d[wp.float32],  # [B, H, W]
         # Out:
         partials: wp.array2d[wp.float32],  # [M, 10]
     ):
         composite_tile_bwd(
-            first + wp.tid(), splats, tile_begin, tile_end, items, item_splat, background, n_columns,
-            v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last, v_image, v_coverage, v_depths,
+            first + wp.tid(), splats, tile_begin, tile_end, isect_ids, gaussian_ids, background, n_columns,
+            v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last_ids, v_image, v_alphas, v_depths,
             partials,
         )  # fmt: skip
 

@@ -226,8 +226,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         width: int,
         height: int,
         low_pass: wp.float64,
-        first_item: wp.array[wp.int32],  # [N] first row of partials
-        n_items: wp.array[wp.int32],  # [N] zero where culled
+        first_isects: wp.array[wp.int32],  # [N] first row of partials
+        tiles_per_gauss: wp.array[wp.int32],  # [N] zero where culled
         partials: wp.array2d[real],  # [M, 10] gradient of each (tile, Gaussian)
         # Out:
         v_means: wp.array[vec3],  # [N]
@@ -239,13 +239,13 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         v_viewmats: wp.array2d[wp.float64],  # [N, 12] share of each Gaussian, or empty
     ):
         n = first + wp.tid()
-        count = n_items[n]
+        count = tiles_per_gauss[n]
         if count == 0:
             return
         v = row10()
         for k in range(count):
             for c in range(10):
-                v[c] += wp.float64(partials[first_item[n] + k, c])
+                v[c] += wp.float64(partials[first_isects[n] + k, c])
         i_view = view_of(view_ids, n)
         view = rotation_part(viewmats[i_view])
         mean = wide3(means[n])

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from mgavatar.kernels import bridge, compositing, compositing_rows, projection
-from mgavatar.kernels.tiling import MAX_ITEMS, WorkLists, build_work_lists
+from mgavatar.kernels.tiling import MAX_ISECTS, WorkLists, build_work_lists
 
 Form = Literal["auto", "plain", "rows"]
 
@@ -47,14 +47,14 @@ class Rendering:
 
     Attributes:
         image: Composited colours, shape [3, H, W], of several views [B, 3, H, W].
-        alpha: Coverage, shape [H, W] or [B, H, W].
-        depth: Sum of blending weight times depth [m], not divided by alpha, shape [H, W] or [B, H, W].
+        alphas: Opacity of each pixel, 1 minus its final transmittance, shape [H, W] or [B, H, W].
+        depths: Sum of blending weight times depth [m], not divided by ``alphas``, shape [H, W] or [B, H, W].
         visible: Which Gaussians touch the image, shape [N], bool.
     """
 
     image: Tensor
-    alpha: Tensor
-    depth: Tensor
+    alphas: Tensor
+    depths: Tensor
     visible: Tensor
 
 
@@ -131,7 +131,7 @@ class Work:
 
     Attributes:
         splats: Footprints, columns ``projection.SPLAT``, shape [N, 16].
-        lists: Depth-sorted splats of each tile.
+        lists: Intersections of each tile, by depth.
         form: ``plain`` or ``rows``.
         n_columns: Tiles across the image.
         size: Image width and height [px].
@@ -161,7 +161,7 @@ class Work:
     def inputs(self) -> list[Any]:
         """What both directions of the blending read."""
         lists = self.lists
-        return [self.splats, lists.tile_begin, lists.tile_end, lists.items, lists.item_splat]
+        return [self.splats, lists.tile_begin, lists.tile_end, lists.isect_ids, lists.gaussian_ids]
 
 
 def project(
@@ -194,13 +194,13 @@ def _by_view(background: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 
 def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tensor]:
-    """Composite: image [3, H, W], coverage, depth, final T [H, W] and the last entry that each pixel accepted.
+    """Composite: image [3, H, W], alphas, depths, final T [H, W] and the last entry that each pixel blended.
 
     With a background of several views, [B, 3], all outputs have B as their first axis.
     """
     width, height = work.size
-    if work.n_views * width * height > MAX_ITEMS:
-        raise ValueError(f"{work.n_views} x {width} x {height} pixels are more than {MAX_ITEMS}: lower the image size")
+    if work.n_views * width * height > MAX_ISECTS:
+        raise ValueError(f"{work.n_views} x {width} x {height} pixels are more than {MAX_ISECTS}: lower the image size")
     plane = (*background.shape[:-1], height, width)
     image = background.new_empty(*background.shape, height, width)
     planes = [background.new_empty(plane) for _ in range(3)]
@@ -217,14 +217,14 @@ def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tens
 
 
 def blend_backward(
-    settings: RasterSettings, work: Work, background: Tensor, final_T: Tensor, last: Tensor, v_planes: list[Tensor]
+    settings: RasterSettings, work: Work, background: Tensor, final_T: Tensor, last_ids: Tensor, v_planes: list[Tensor]
 ) -> Tensor:
-    """Gradient of each item's splat, columns ``projection.GRADIENT``, shape [M, 10]."""
+    """Compute the gradient of each intersection's splat, columns ``projection.GRADIENT``, shape [M, 10]."""
     rows = work.form == "rows"
-    # The rows write every item; the plain form on a CPU adds up threads that run one after the other.
-    partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.items), 10)
+    # The rows write every intersection; the plain form on a CPU adds up threads that run one after the other.
+    partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.isect_ids), 10)
     inputs = [*work.inputs, *_by_view(background, background), work.n_columns]
-    rest = [settings.alpha_threshold, settings.alpha_cap, *_by_view(background, final_T, last, *v_planes)]
+    rest = [settings.alpha_threshold, settings.alpha_cap, *_by_view(background, final_T, last_ids, *v_planes)]
     if rows:
         bridge.launch_ranges(compositing_rows.KERNELS[settings.exp][1], work.n_tiles, [*inputs, *rest], [partials])
     else:
@@ -264,22 +264,22 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         tensors = tuple(tensor.contiguous() for tensor in tensors)
         work = project(settings, size, tensors, view_ids)
-        image, coverage, depth, final_T, last = blend(settings, work, tensors[-1])
-        ctx.save_for_backward(*tensors, work.view_ids, final_T, last)
+        image, alphas, depths, final_T, last_ids = blend(settings, work, tensors[-1])
+        ctx.save_for_backward(*tensors, work.view_ids, final_T, last_ids)
         ctx.work, ctx.settings, ctx.screen_grads = work, settings, screen_grads
-        visible = work.lists.n_items > 0
+        visible = work.lists.tiles_per_gauss > 0
         ctx.mark_non_differentiable(visible)
-        return image, coverage, depth, visible
+        return image, alphas, depths, visible
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_coverage: Tensor, v_depth: Tensor, _: Tensor) -> Any:
-        *tensors, _, final_T, last = ctx.saved_tensors  # torch raises here if one was changed in place
+    def backward(ctx: Any, v_image: Tensor, v_alphas: Tensor, v_depths: Tensor, _: Tensor) -> Any:
+        *tensors, _, final_T, last_ids = ctx.saved_tensors  # torch raises here if one was changed in place
         means, quats, scales, _, _, viewmat, K, background = tensors
         work: Work = ctx.work
         settings: RasterSettings = ctx.settings
-        v_planes = [v.contiguous() for v in (v_image, v_coverage, v_depth)]
-        partials = blend_backward(settings, work, background, final_T, last, v_planes)
+        v_planes = [v.contiguous() for v in (v_image, v_alphas, v_depths)]
+        partials = blend_backward(settings, work, background, final_T, last_ids, v_planes)
         grads = [torch.zeros_like(tensor) for tensor in tensors[:5]]
         means2d = ctx.screen_grads if ctx.screen_grads is not None else means.new_empty(len(means), 2)
         means2d.zero_()
@@ -288,7 +288,7 @@ class _Rasterize(torch.autograd.Function):
         v_views = torch.zeros(len(means) if wants_camera else 0, 12, dtype=torch.float64, device=means.device)
         if len(means):
             inputs = [means, quats, scales, viewmat.view(-1, 4, 4), K.view(-1, 3, 3), work.view_ids, *work.size]
-            inputs += [settings.low_pass, work.lists.first_item, work.lists.n_items, partials]
+            inputs += [settings.low_pass, work.lists.first_isects, work.lists.tiles_per_gauss, partials]
             kernel = projection.KERNELS[means.dtype][1]
             bridge.launch_ranges(kernel, len(means), inputs, [*grads, means2d, v_views], ranges_per_thread=2)
         v_viewmat = _camera_gradient(v_views, work.view_ids, viewmat) if wants_camera else None
@@ -334,11 +334,11 @@ def rasterize(
         view_ids: View of each Gaussian where there are several, shape [N], int32.
 
     Returns:
-        Image, coverage, depth and visibility; the first three by view where there are several.
+        Image, alphas, depths and visibility; the first three by view where there are several.
 
     Raises:
         ValueError: If shapes, dtypes, devices or settings do not fit, ``view_ids`` name a view that is not there, or
-            the work exceeds 2^31 - 1 items or pixels.
+            the work exceeds 2^31 - 1 intersections or pixels.
     """
     settings = settings or RasterSettings()
     background = means.new_zeros(*viewmat.shape[:-2], 3) if background is None else background

@@ -76,7 +76,7 @@ def assert_same_images(a: Avatar, b: Avatar, subject: Subject) -> None:
     for pose in poses(a, subject):
         for camera in cameras:
             one, other = a.render(pose, camera), b.render(pose, camera)
-            assert one.alpha.max() > 0.5
+            assert one.alphas.max() > 0.5
             for name in ("image", "alpha", "depth"):
                 assert torch.equal(getattr(one, name), getattr(other, name)), name
         assert torch.equal(a.verts(pose), b.verts(pose))

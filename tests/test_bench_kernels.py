@@ -49,7 +49,7 @@ def test_a_fitted_avatar_is_timed_as_it_is_drawn(tmp_path):
     avatar.save(tmp_path / "avatar.pt")
     job = kernels_work.avatar_job(tmp_path / "avatar.pt", CPU)
     drawn = avatar.render(mean_pose(avatar), avatar.capture.mean_camera(), background=torch.zeros(3))
-    assert drawn.alpha.mean() > 0.02
+    assert drawn.alphas.mean() > 0.02
     assert loss_of(job.step) == pytest.approx(float(drawn.image.square().sum()), rel=1e-4)
     assert loss_of(job.plain) == pytest.approx(loss_of(job.step), rel=1e-4)
     assert job.operations > 0

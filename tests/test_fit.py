@@ -242,7 +242,7 @@ def test_ctrl_c_leaves_an_avatar_and_resume_ends_as_if_nothing_had_been(
     assert signal.getsignal(signal.SIGINT) is before
     avatar = Avatar.load(tmp_path / "run" / "avatar.pt")
     assert (avatar.appearance is None) is (stage == "geometry")
-    assert avatar.render(avatar.head.pose(0), avatar.capture.mean_camera()).alpha.max() > 0.5
+    assert avatar.render(avatar.head.pose(0), avatar.capture.mean_camera()).alphas.max() > 0.5
     resumed = fit_into(tmp_path / "run", subject, resume=True)
     assert differing(whole, resumed) == []
     drop = ("seconds",)

@@ -57,8 +57,8 @@ def cotangents_for(views: list[Scene], dtype: torch.dtype) -> Tensor:
 
 
 def planes(out: Rendering) -> Tensor:
-    """Image, coverage and depth in one, shape [..., 5, H, W]."""
-    return torch.cat([out.image, out.alpha.unsqueeze(-3), out.depth.unsqueeze(-3)], -3)
+    """Return image, alphas and depths in one, shape [..., 5, H, W]."""
+    return torch.cat([out.image, out.alphas.unsqueeze(-3), out.depths.unsqueeze(-3)], -3)
 
 
 def draw(leaves: list[Tensor], **arguments: Any) -> Tensor:

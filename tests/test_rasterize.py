@@ -25,7 +25,7 @@ from twins import raster as twin
 from mgavatar.kernels.rasterize import RasterSettings, rasterize
 
 IMAGE = 1e-6
-"""Largest absolute error of colour and coverage."""
+"""Largest absolute error of colours and alphas."""
 
 GRADIENT = 5e-6
 """Largest relative L2 error of any gradient."""
@@ -95,8 +95,8 @@ def test_one_gaussian_known_by_hand(device, form):
         **gaussian, **on(device, CAMERA), size=(2, 1), background=background, settings=RasterSettings(form=form)
     )
     side = 0.8 * math.exp(-1 / 2.6)
-    assert out.alpha.tolist()[0] == pytest.approx([0.8, side], rel=1e-6)
-    assert out.depth.tolist()[0] == pytest.approx([1.6, 2 * side], rel=1e-6)
+    assert out.alphas.tolist()[0] == pytest.approx([0.8, side], rel=1e-6)
+    assert out.depths.tolist()[0] == pytest.approx([1.6, 2 * side], rel=1e-6)
     assert out.image[:, 0, 0].tolist() == pytest.approx([0.8, 0.4, 0.2 + 0.2], rel=1e-6)
     assert out.visible.tolist() == [True]
     grads = torch.autograd.grad(out.image[2, 0, 1], [*leaves, background])
@@ -120,7 +120,7 @@ def test_two_gaussians_blend_front_to_back(device, form):
     settings = RasterSettings(form=form)
     out = rasterize(**both, **on(device, CAMERA), size=(1, 1), background=background, settings=settings)
     assert out.image[:, 0, 0].tolist() == pytest.approx([0.5, 0.25 + 0.3, 0.125 + 0.2 * 2], rel=1e-6)
-    assert float(out.depth) == pytest.approx(0.5 * 2 + 0.5 * 0.6 * 4, rel=1e-6)
+    assert float(out.depths) == pytest.approx(0.5 * 2 + 0.5 * 0.6 * 4, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -218,7 +218,7 @@ def test_screen_gradients_are_those_of_the_means_in_the_image(device, form):
         *leaves[:5], viewmat=leaves[5], background=leaves[6], K=narrow.K, size=scene.size, settings=scene.settings,
         screen_grads=screen,
     )  # fmt: skip
-    torch.cat([out.image, out.alpha[None], out.depth[None]]).backward(cotangent.to(device))
+    torch.cat([out.image, out.alphas[None], out.depths[None]]).backward(cotangent.to(device))
     shift = torch.zeros(len(scene.means), 2, dtype=torch.float64, requires_grad=True)
     wide = scene.to(torch.float64)
     twin.rasterize(*wide.tensors, K=wide.K, size=wide.size, settings=wide.settings, shift=shift).backward(

@@ -43,7 +43,7 @@ same numbers.
   not fit into single precision. Culled Gaussians change nothing and get a zero gradient.
 """
 
-FORWARD = "largest error of colour and coverage"
+FORWARD = "largest error of colours and alphas"
 
 
 def _number(x: float) -> str:

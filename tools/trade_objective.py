@@ -134,7 +134,7 @@ def seen_colors(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor]:
         points = scene.gaussians[0] @ viewmat[:3, :3].T + viewmat[:3, 3]
         pixels = (points @ K.T)[:, :2] / points[:, 2:]
         grid = (2.0 * pixels / torch.tensor([scene.camera.width, scene.camera.height]) - 1.0)[None, None]
-        maps = torch.cat([scene.target, drawn.depth[None], drawn.alpha[None]])[None]
+        maps = torch.cat([scene.target, drawn.depths[None], drawn.alphas[None]])[None]
         values = functional.grid_sample(maps, grid, align_corners=False)[0, :, 0].T
         covered = (grid[0, 0].abs() < 1.0).all(1) & (values[:, 4] > 0.9) & (points[:, 2] > 0.0)
         seen = covered & (points[:, 2] < 1.01 * values[:, 3] / values[:, 4].clamp(min=0.1))

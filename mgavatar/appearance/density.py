@@ -31,7 +31,7 @@ class DensityControl:
 
     def collect(self, screen_grads: Tensor, rendering: Rendering) -> None:
         """Add one view's gradients of the image-space means, in half image sizes as the field counts them."""
-        height, width = rendering.alpha.shape
+        height, width = rendering.alphas.shape
         half = torch.tensor([0.5 * width, 0.5 * height], device=screen_grads.device)
         self.total += torch.where(rendering.visible, (screen_grads * half).norm(dim=1), 0.0)
         self.seen += rendering.visible

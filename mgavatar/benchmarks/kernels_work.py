@@ -179,8 +179,8 @@ def blending_step(n: int, size: tuple[int, int], device: torch.device) -> Step:
     work = project(settings, size, (*(t.detach() for t in scene.gaussians), scene.viewmat, scene.K, background))
 
     def step() -> Callable[[], object]:
-        image, coverage, depth, final_T, last = blend(settings, work, background)
-        return lambda: blend_backward(settings, work, background, final_T, last, [image, coverage, depth])
+        image, alphas, depths, final_T, last_ids = blend(settings, work, background)
+        return lambda: blend_backward(settings, work, background, final_T, last_ids, [image, alphas, depths])
 
     return step
 

@@ -229,12 +229,12 @@ def write_exr(path: Path, rendering: Rendering, camera: Camera, *, frame: int) -
         camera: What it was seen with; goes into the header.
         frame: Its number; goes into the header.
     """
-    alpha = rendering.alpha.detach().cpu().clamp(0.0, 1.0)
+    alpha = rendering.alphas.detach().cpu().clamp(0.0, 1.0)
     covered = alpha > 1e-4
     divisor = torch.where(covered, alpha, 1.0)
     linear = srgb_to_linear((rendering.image.detach().cpu() / divisor).clamp(0.0, 1.0)) * alpha
     rgba = torch.cat([linear, alpha[None]]).where(covered, 0.0).permute(1, 2, 0).half()
-    depth = torch.where(covered, rendering.depth.detach().cpu() / divisor, EMPTY_DEPTH).float()
+    depth = torch.where(covered, rendering.depths.detach().cpu() / divisor, EMPTY_DEPTH).float()
     channels = {"RGBA": rgba.contiguous().numpy(), "Z": depth.contiguous().numpy()}
     with OpenEXR.File(_exr_header(camera, frame), channels) as file:
         file.write(str(path))

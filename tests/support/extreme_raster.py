@@ -46,7 +46,7 @@ def _op(scene: Scene) -> Callable[..., Tensor]:
         K = scene.K.to(viewmat)
         settings = scene.knobs(form=form).settings
         out = rasterize(*gaussians, viewmat=viewmat, background=background, K=K, size=scene.size, settings=settings)
-        return torch.cat([out.image, out.alpha[None], out.depth[None]])
+        return torch.cat([out.image, out.alphas[None], out.depths[None]])
 
     return render
 

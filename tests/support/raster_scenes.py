@@ -81,12 +81,12 @@ def ball_scene(n: int = 300, size: tuple[int, int] = (75, 53), *, seed: int = 0,
 
 
 def render(scene: Scene, tensors: tuple[Tensor, ...] | None = None) -> Tensor:
-    """The rasterizer's image, coverage and depth in one, shape [5, H, W]."""
+    """Draw image, alphas and depths in one, shape [5, H, W]."""
     *gaussians, viewmat, background = tensors or scene.tensors
     out = rasterize(
         *gaussians, viewmat=viewmat, background=background, K=scene.K, size=scene.size, settings=scene.settings
     )
-    return torch.cat([out.image, out.alpha[None], out.depth[None]])
+    return torch.cat([out.image, out.alphas[None], out.depths[None]])
 
 
 def render_twin(scene: Scene, tensors: tuple[Tensor, ...] | None = None) -> Tensor:
@@ -119,7 +119,7 @@ class Errors:
     """Distance of the rasterizer from its twin.
 
     Attributes:
-        image: Largest absolute error of the colours and the coverage.
+        image: Largest absolute error of the colours and the alphas.
         depth: Largest error of the depth, relative to the largest depth.
         gradients: Relative L2 error by input.
         flipped: Share of all pixels whose error exceeds ``image``'s goal.

@@ -110,7 +110,7 @@ def rasterize(
     settings: RasterSettings,
     shift: Tensor | None = None,
 ) -> Tensor:
-    """Red, green, blue, coverage and depth, shape [5, H, W]; ``shift`` [N, 2] moves the means in the image [px]."""
+    """Draw red, green, blue, alpha and depth, shape [5, H, W]; ``shift`` [N, 2] moves the means in the image [px]."""
     seen = project(means, quats, scales, opacities, viewmat, K, size, settings)
     if shift is not None:
         seen = replace(seen, means2d=seen.means2d + shift[seen.order])
