@@ -16,6 +16,7 @@ from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
 from mgavatar.errors import DataError
+from mgavatar.head.find import find_head_model
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
 from mgavatar.head.procedural.build import build_head
@@ -80,6 +81,19 @@ def test_layout_is_complete(capture: Path) -> None:
     rest = {p.name for p in capture.iterdir()} - {"images", "fg_masks", "flame_param", "ground_truth"}
     assert rest == {"canonical_flame_param.npz", *(f"transforms{s}.json" for s in ("", "_train", "_val", "_test"))}
     assert [p.name for p in capture.parent.iterdir()] == [capture.name]
+
+
+def test_the_transforms_name_the_head_model(capture: Path, head: HeadModel, tmp_path: Path) -> None:
+    """``builtin``, or the file beside them into which any other head model is saved."""
+    transforms = ("", *(f"_{split}" for split in SPLITS))
+    assert {meta(capture, name)["head_model"] for name in transforms} == {"builtin"}
+    other = replace(head, v_template=head.v_template * np.float32(1.05), name="mine.npz")
+    out = make_synthetic_capture(tmp_path / "other", cameras=2, timesteps=2, size=(8, 8), head=other)
+    assert {meta(out, name)["head_model"] for name in transforms} == {"head_model.npz"}
+    found = find_head_model(out)
+    np.testing.assert_array_equal(found.v_template, other.v_template)
+    np.testing.assert_array_equal(found.shapedirs, other.shapedirs)
+    assert (found.expr_basis, found.expr_names) == (other.expr_basis, other.expr_names)
 
 
 def test_frames_name_existing_files_and_hold_the_fields_keys(capture: Path) -> None:

@@ -21,8 +21,11 @@ from PIL import Image
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import SPLITS, Split
 from mgavatar.errors import DataError
+from mgavatar.head.find import BUILTIN, HEAD_MODEL_FILE, HEAD_MODEL_KEY
+from mgavatar.head.load import save_head_model
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import MOTION_KEYS, HeadParams, pad_or_truncate
+from mgavatar.head.procedural.build import build_head
 from mgavatar.synthetic.motion import perform, tracked
 from mgavatar.synthetic.person import Person, make_person
 from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
@@ -50,8 +53,9 @@ def make_synthetic_capture(
     The person has a drawn identity, hair, clothed shoulders far wider than the bust, and muscles that move, none of
     which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes
     the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps and ``test`` all cameras
-    at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The same arguments write the same
-    bytes.
+    at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The transforms files name the head
+    model. ``head_model.npz`` holds it unless it is the built-in one: do not pass on such a capture if the licence of
+    its head model forbids it. The same arguments write the same bytes.
 
     Of a monocular capture, training and ``test`` are what its one camera, number 0, sees of a head that turns 20
     degrees to either side; ``val`` is what it does not see: cameras 1 and 2 stand 60 degrees to either side and look
@@ -75,10 +79,7 @@ def make_synthetic_capture(
     """
     out = Path(out)
     _check(out, 1 if monocular else cameras, timesteps, size, monocular=monocular)
-    if head is None:
-        from mgavatar.head.procedural.build import build_head
-
-        head = build_head()
+    head = build_head() if head is None else head
     rng = np.random.default_rng(seed)
     person = make_person(head, rng)
     studio = Studio(person, make_look(person, rng))
@@ -90,7 +91,7 @@ def make_synthetic_capture(
         members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
         truth = _shoot_all(partial, studio, motion, views, members, progress)
         _write_params(partial, head, tracked(motion, rng))
-        _write_transforms(partial, views, members)
+        _write_transforms(partial, views, members, head_model=_write_head_model(partial, head))
         _write_truth(partial, person, motion, seed, *truth)
         if out.exists():
             out.rmdir()
@@ -198,7 +199,15 @@ def _vhap(motion: HeadParams, frame: int, n_expr: int) -> dict[str, np.ndarray]:
     return {"shape": np.zeros(_N_SHAPE, np.float32), **rows, "expr": pad_or_truncate(rows["expr"], n_expr)}
 
 
-def _write_transforms(root: Path, views: list[Camera], members: Members) -> None:
+def _write_head_model(root: Path, head: HeadModel) -> str:
+    """Save the head model unless it is the built-in one; return its name for the transforms files."""
+    if head is build_head():  # built once and shared
+        return BUILTIN
+    save_head_model(root / HEAD_MODEL_FILE, head)
+    return HEAD_MODEL_FILE
+
+
+def _write_transforms(root: Path, views: list[Camera], members: Members, *, head_model: str) -> None:
     every = sorted(set().union(*members.values()))
     for name, chosen in (("", every), *((f"_{split}", sorted(members[split])) for split in SPLITS)):
         frames = [_frame(t, c, views[c]) for t, c in chosen]
@@ -208,6 +217,7 @@ def _write_transforms(root: Path, views: list[Camera], members: Members) -> None
             **lens,
             "timestep_indices": sorted({t for t, _ in chosen}),
             "camera_indices": sorted({c for _, c in chosen}),
+            HEAD_MODEL_KEY: head_model,
         }
         (root / f"transforms{name}.json").write_text(json.dumps(meta, indent=1), "utf-8")
 
