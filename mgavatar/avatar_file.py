@@ -16,7 +16,7 @@ from mgavatar import __version__
 from mgavatar.appearance.model import Appearance, build_appearance
 from mgavatar.camera import Camera
 from mgavatar.capture.info import CaptureInfo
-from mgavatar.config import FitConfig, check, from_dict
+from mgavatar.config import FitConfig, check, from_dict, settled
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file, one_line
 from mgavatar.geometry.head import PersonalHead
@@ -89,7 +89,8 @@ def read_avatar(path: Path, *, device: torch.device | str = "cpu") -> AvatarPart
             name: value.numpy() if isinstance(value, Tensor) else np.array(value)
             for name, value in payload["head"].items()
         }
-        body = Body(head_from_arrays(arrays, path=path), subdivisions=config.geometry.subdivisions, device=device)
+        subdivisions = settled(config.geometry.subdivisions)
+        body = Body(head_from_arrays(arrays, path=path), subdivisions=subdivisions, device=device)
         capture = _capture_of(payload["capture"])
         head = PersonalHead(body, capture.tracked, config.geometry)
         vertex_gaussians = VertexGaussians(head, config)

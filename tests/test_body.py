@@ -11,7 +11,7 @@ import trimesh
 from ball_head import ball_head
 from scipy.spatial.transform import Rotation
 
-from mgavatar.head.body import FINE_ENOUGH, Body
+from mgavatar.head.body import Body
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
 from mgavatar.head.procedural.build import build_head
@@ -162,14 +162,6 @@ def test_twice_subdivided_is_subdivided_twice():
     fine = subdivide(subdivide(model)[0])[0]
     assert len(body.faces) == 16 * len(model.faces)
     assert np.abs(body.carry(body.v_template).numpy() - fine.v_template).max() < 1e-7
-
-
-def test_automatic_subdivision_goes_by_the_number_of_vertices():
-    """Once for a coarse head, not at all for one that is as fine as the paper's mesh."""
-    assert Body(ball_head(), subdivisions="auto").subdivisions == 1
-    fine = ball_head(trimesh.creation.icosphere(subdivisions=6, radius=0.1), n_shape=1, n_expr=1)
-    assert len(fine.v_template) >= FINE_ENOUGH
-    assert Body(fine, subdivisions="auto").subdivisions == 0
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])

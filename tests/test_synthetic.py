@@ -380,6 +380,25 @@ def test_subdivision_keeps_the_surface() -> None:
     np.testing.assert_allclose(vertex_normals(verts, more), np.tile([0.0, 0, 1], (25, 1)))
 
 
+def test_subdivision_keeps_the_order_of_faces() -> None:
+    """All first quarters, then all second ones: the bits of every capture depend on it."""
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    fine, more = subdivision(np.tile(faces, (5_000, 1)), 4)  # 10,000 faces are subdivided once
+    assert fine.shape == (4 + 5, 4)
+    ab, ac, bc, bd, cd = range(4, 9)
+    quarters = [
+        [0, ab, ac],
+        [2, bc, cd],
+        [ab, 1, bc],
+        [bc, 1, bd],
+        [ac, bc, 2],
+        [cd, bd, 3],
+        [ab, bc, ac],
+        [bc, bd, cd],
+    ]
+    np.testing.assert_array_equal(more[[0, 1, 10_000, 10_001, 20_000, 20_001, 30_000, 30_001]], quarters)
+
+
 def test_cameras_stand_around_the_face() -> None:
     views = frontal_arc(16, (64, 64))
     yaws = np.degrees([np.arctan2(v.position[0], v.position[2] + 0.02) for v in views])

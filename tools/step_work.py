@@ -11,7 +11,7 @@ import torch
 from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.capture.read import read_capture
-from mgavatar.config import FitConfig, from_dict, read_preset
+from mgavatar.config import FitConfig, from_dict, read_preset, settled
 from mgavatar.fitting.plan import plan
 from mgavatar.fitting.stage import Stage
 from mgavatar.fitting.views import Views
@@ -76,7 +76,7 @@ class Bench:
         self.config, _ = plan(size.config, head_model, subject)
         self.background = torch.tensor(subject.background, device=device)
         self.views = Views.of(subject, 8192, with_masks=self.config.random_background)
-        body = Body(head_model, subdivisions=self.config.geometry.subdivisions, device=device)
+        body = Body(head_model, subdivisions=settled(self.config.geometry.subdivisions), device=device)
         self.head = PersonalHead(body, subject.params, self.config.geometry)
 
     def step(self, stage: Stage, iteration: int) -> None:

@@ -13,7 +13,7 @@ from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar
 from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
-from mgavatar.config import FitConfig
+from mgavatar.config import FitConfig, settled
 from mgavatar.fitting.budget import Budget, TooShort, duration
 from mgavatar.fitting.loop import Loop
 from mgavatar.fitting.plan import plan
@@ -61,7 +61,7 @@ def fit(
     metrics = MetricsLog(run.metrics)
     background = torch.tensor(subject.background, device=device)
     loop = Loop(config, run, metrics, background, seed, summary, budget, fresh=checkpoint is None)
-    body = Body(head_model, subdivisions=config.geometry.subdivisions, device=device)
+    body = Body(head_model, subdivisions=settled(config.geometry.subdivisions), device=device)
     head = PersonalHead(body, subject.params, config.geometry)
     vertex_gaussians = VertexGaussians(head, config)
     finished: dict[str, Any] = {}

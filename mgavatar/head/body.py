@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
@@ -17,9 +16,6 @@ from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
-FINE_ENOUGH = 12_000
-"""Vertices; the paper's mesh has 20K."""
-
 
 class Body:
     """The subdivided head. Directions are linear, so they are evaluated on the base mesh and then carried over.
@@ -29,12 +25,14 @@ class Body:
         fine: The same after subdivision, without its directions.
     """
 
-    def __init__(
-        self, model: HeadModel, *, subdivisions: int | Literal["auto"], device: torch.device | str = "cpu"
-    ) -> None:
-        """Subdivide so many times; ``auto`` is once, unless the model is about as fine as the paper's mesh already."""
-        if subdivisions == "auto":
-            subdivisions = 1 if len(model.v_template) < FINE_ENOUGH else 0
+    def __init__(self, model: HeadModel, *, subdivisions: int, device: torch.device | str = "cpu") -> None:
+        """Subdivide a head model and move it to a device.
+
+        Args:
+            model: The head model.
+            subdivisions: Number of midpoint subdivisions; the paper's mesh is FLAME's after one.
+            device: Device of all tensors.
+        """
         self.model = model
         self.subdivisions = subdivisions
         self.device = torch.device(device)

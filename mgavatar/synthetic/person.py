@@ -11,13 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
+from mgavatar.head.subdivide import split_faces
 from mgavatar.synthetic.garment import drape
 
 SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
 """Materials, numbered as in kernels/portrait.py."""
 
 _MIN_FACES = 30_000
-"""The head is subdivided until hair and silhouette have at least this many faces, at most twice."""
+"""The head is subdivided until it has at least this many faces, for the sake of hair and silhouette."""
+_MAX_SUBDIVISIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,20 +130,23 @@ def shaped_vertices(head: HeadModel, betas: np.ndarray, expr: np.ndarray) -> np.
 
 
 def subdivision(faces: np.ndarray, n_verts: int) -> tuple[sp.csr_matrix, np.ndarray]:
-    """Midpoint subdivision as a sparse matrix [H, V], and its faces; none where the mesh is fine enough already."""
+    """Return midpoint subdivision as a sparse matrix, shape [H, V], and its faces, shape [F, 3].
+
+    A mesh with enough faces is not subdivided; the matrix is then the identity.
+    """
     fine = sp.identity(n_verts, format="csr")
-    for _ in range(2):
+    for _ in range(_MAX_SUBDIVISIONS):
         if len(faces) >= _MIN_FACES:
             break
-        sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
-        edges, inverse = np.unique(sides, axis=0, return_inverse=True)
-        middle = inverse.reshape(-1, 3) + fine.shape[0]
-        rows = np.repeat(np.arange(len(edges)), 2)
-        halves = sp.csr_matrix((np.full(2 * len(edges), 0.5), (rows, edges.ravel())), (len(edges), fine.shape[0]))
+        n_coarse = fine.shape[0]
+        faces, parents = split_faces(faces, n_coarse)
+        ends = parents[n_coarse:]
+        rows = np.repeat(np.arange(len(ends)), 2)
+        halves = sp.csr_matrix((np.full(ends.size, 0.5), (rows, ends.ravel())), (len(ends), n_coarse))
         fine = sp.vstack([fine, halves @ fine], format="csr")
-        (a, b, c), (ab, bc, ca) = faces.T, middle.T
-        quarters = [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]
-        faces = np.concatenate([np.stack(corner, axis=1) for corner in quarters])
+        # From four quarters per face to all first quarters, all second ones, ...: the order of the faces in every
+        # capture so far. A seed must give the same bits, and sums over faces depend on their order.
+        faces = faces.reshape(-1, 4, 3).swapaxes(0, 1).reshape(-1, 3)
     return fine, faces
 
 
