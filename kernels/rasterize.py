@@ -23,7 +23,7 @@ LARGEST_CAP = 1.0 - 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class RasterSettings:
-    """What the rasterizer leaves out, and where; ``docs/tradeoffs.md`` has the price of each."""
+    """What the rasterizer leaves out, and where; ``docs/lab/tradeoffs.md`` has the price of each."""
 
     alpha_threshold: float = 1.0 / 255.0
     """Contributions below this alpha are skipped; 0 blends every Gaussian with every pixel."""

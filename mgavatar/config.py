@@ -206,7 +206,7 @@ ACCURACY: dict[Accuracy, tuple[float, float]] = {
     "balanced": (1.0 / 255.0, 1e-4),
     "fast": (1.0 / 64.0, 1e-3),
 }
-"""Alpha threshold and stop of each level; ``docs/tradeoffs.md`` has what they cost and save."""
+"""Alpha threshold and stop of each level; ``docs/quality-and-speed.md`` has what they cost and save."""
 
 
 @dataclass(frozen=True, kw_only=True)

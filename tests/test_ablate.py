@@ -12,9 +12,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import ablate
 import numpy as np
 import pytest
 import torch
+from ablate import Options, main, plan_cells, run_command
+from ablate_sheet import contact_sheet
+from markdown_cells import cells_of
 from PIL import Image
 from tiny import tiny_config, tiny_head, write_tiny_capture
 from tiny_avatar import tiny_avatar
@@ -22,12 +26,6 @@ from tiny_avatar import tiny_avatar
 from mgavatar.config import to_toml
 from mgavatar.errors import DataError
 from mgavatar.head.load import save_head_model
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tools"))
-
-import ablate
-from ablate import Options, main, plan_cells, run_command
-from ablate_sheet import contact_sheet
 
 REASON = "no weights given (--lpips-weights)"
 GEOMETRY = {
@@ -130,9 +128,7 @@ def test_the_table_shows_differences_to_the_first_preset(
 ) -> None:
     assert _run(tmp_path, captures) == 0
     text = (tmp_path / "out/table.md").read_text()
-    lines = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in text.splitlines() if line[:1] == "|"]
-    titles, first, second, third = lines[0], lines[2], lines[3], lines[4]
-    assert all(len(line) == len(titles) for line in lines if line[0][:1] != "-")
+    titles, first, second, third, _ = cells_of(text)
     named = dict(zip(titles, second, strict=True))
     assert named["val PSNR"] == "31.00 (+1.00)"
     assert named["val LPIPS"] == "–"
@@ -155,15 +151,17 @@ def test_several_seeds_become_one_row_of_means(tmp_path: Path, captures: list[st
     rows = json.loads((tmp_path / "out/table.json").read_text())["rows"]
     assert [row["val"]["psnr"] for row in rows] == [30.0, 32.0, 31.0, 33.0]
     text = (tmp_path / "out/table.md").read_text()
-    assert "| ann | quick | 31.00 ± 1.41 |" in text
-    assert "| ann | quick,baseline | 32.00 ± 1.41 (+1.00) |" in text
+    assert [row[:3] for row in cells_of(text)[1:]] == [
+        ["ann", "quick", "31.00 ± 1.41"],
+        ["ann", "quick,baseline", "32.00 ± 1.41 (+1.00)"],
+    ]
     assert "seeds 4, 5" in text
     fake.breaks = lambda command: "seed6" in " ".join(command)
     assert _run(tmp_path, captures[:1], "--seeds", "4", "6") == 1
     text = (tmp_path / "out/table.md").read_text()
-    assert "| ann | quick | 30.00 |" in text
+    assert cells_of(text)[1][:3] == ["ann", "quick", "30.00"]
     assert "* ann, quick, seed 6: fit ended with 1" in text
-    with pytest.raises(DataError, match="one name"):
+    with pytest.raises(DataError, match="share a name"):
         plan_cells(["quick"], captures, Options(tmp_path / "out", seeds=(1, 1)))
 
 
@@ -205,7 +203,7 @@ def test_a_failed_cell_is_reported_and_the_others_go_on(
     assert _run(tmp_path, captures[::-1]) == 1
     assert "fit ended with 1: mgavatar: bob.png: is damaged" in capsys.readouterr().err
     text = (tmp_path / "out/table.md").read_text()
-    assert "| bob | quick | failed |" in text
+    assert ["bob", "quick", "failed"] in [row[:3] for row in cells_of(text)]
     assert "* bob, quick, seed 0: fit ended with 1: mgavatar: bob.png: is damaged" in text
     assert "| bob | quick,baseline |" in text  # its reference is missing, its figures are not
     fake.breaks = lambda command: command[0] == "evaluate"
@@ -243,8 +241,8 @@ def test_what_is_missing_is_said_before_any_work(tmp_path: Path, captures: list[
         (["quik"], captures, "no preset 'quik'"),
         (["quick"], [str(tmp_path / "gone")], "no transforms_train.json"),
         (["quick"], [f"{captures[0]}:{tmp_path}/head.npz"], r"head\.npz: no such file"),
-        (["quick", "quick"], captures, "one name"),
-        (["quick"], [captures[0], captures[0]], "one name"),
+        (["quick", "quick"], captures, "share a name"),
+        (["quick"], [captures[0], captures[0]], "share a name"),
     ):
         with pytest.raises(DataError, match=message):
             plan_cells(presets, places, options)

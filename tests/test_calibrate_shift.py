@@ -2,28 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
-
+import calibrate_shift as tool
 import numpy as np
 import pytest
 import torch
-
-PATH = Path(__file__).resolve().parent.parent / "tools" / "calibrate_shift.py"
-
-
-@pytest.fixture(scope="module")
-def tool():
-    """The script as a module."""
-    spec = importlib.util.spec_from_file_location("calibrate_shift", PATH)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+from markdown_cells import cells_of
 
 
-def test_the_disc_is_as_large_as_a_ball_looks(tool):
+def test_the_disc_is_as_large_as_a_ball_looks():
     """From 1 m the outline of a ball is that of its tangent cone, a little larger than the ball's own radius."""
     camera = tool.cameras(200.0, 64)[3]
     image = tool.photograph(camera, "disc", torch.ones(3))
@@ -33,7 +19,7 @@ def test_the_disc_is_as_large_as_a_ball_looks(tool):
     assert image[:, 32, 32].tolist() == pytest.approx([0.4] * 3)
 
 
-def test_a_texture_stays_where_it_is_on_the_ball(tool):
+def test_a_texture_stays_where_it_is_on_the_ball():
     """The middle of each picture shows the point of the ball that faces the camera."""
     for camera in tool.cameras(800.0, 64)[::5]:
         image = tool.photograph(camera, "texture", torch.ones(3), samples=1)
@@ -41,7 +27,7 @@ def test_a_texture_stays_where_it_is_on_the_ball(tool):
         assert np.allclose(image[:, 31:33, 31:33].mean((1, 2)), facing, atol=0.01)
 
 
-def test_gaussians_settle_inside_and_the_shift_brings_the_vertices_back(tool):
+def test_gaussians_settle_inside_and_the_shift_brings_the_vertices_back():
     """An outline pulls the vertices further inside than a texture; one shift serves both to a millimetre or two."""
     surfaces = ("disc", "texture")
     disc, texture = (tool.calibrate(0.35, 2.0, surface, 0.0, iterations=60) for surface in surfaces)
@@ -49,3 +35,11 @@ def test_gaussians_settle_inside_and_the_shift_brings_the_vertices_back(tool):
     disc, texture = (tool.calibrate(0.35, 2.0, surface, 2.0, iterations=60) for surface in surfaces)
     assert abs(disc) < 1e-3
     assert abs(texture) < 2e-3
+
+
+def test_the_table_has_a_row_per_combination(monkeypatch):
+    """Errors in millimetres, with their signs; the fits themselves are tested above."""
+    monkeypatch.setattr(tool, "calibrate", lambda sigma, edge_px, surface, shift: 1e-3 * (shift - sigma))
+    rows = cells_of(tool.table((0.25, 0.5), (3.0,)))
+    assert len(rows) == 1 + 4
+    assert rows[1] == ["0.25", "3 px", "disc", "-0.25", "+1.25", "+1.55", "+1.75", "+2.25"]

@@ -1,14 +1,18 @@
-"""Fit presets to captures under equal conditions and put them side by side: a table and a contact sheet.
+"""Fit presets to captures under equal conditions and compare them in a table and a contact sheet.
 
-python tools/ablate.py --presets quick quick,baseline quick,no-laplacian --captures DIR[:HEAD.npz] ... --out DIR
+    python tools/ablate.py --presets quick quick,baseline quick,no-laplacian --captures DIR[:HEAD.npz] ... --out DIR
 
-Each cell, one preset on one capture from one seed, is a `mgavatar fit` and a `mgavatar evaluate` in processes of their
-own. What is done is not done again, an interrupted fit goes on, a failed one is reported and tried again the next time.
---out gets table.md with the means over the seeds, table.json with every cell, sheet.png of the first seed, and a folder
-for each cell with its run, its log and its metrics.json.
+A cell is one preset on one capture from one seed: a `mgavatar fit` and a `mgavatar evaluate`, each in a process of its
+own. Finished cells are kept, an interrupted fit is resumed, and a failed one is reported and tried again by the next
+call. --out gets
 
-Seconds and memory are the fit's own. A --budget runs from the start of the process, and the first fit after a change of
-the kernels compiles them: fit once before, for equal time.
+* table.md with the means over the seeds,
+* table.json with every cell,
+* sheet.png of the first seed,
+* one folder per cell with its run, its log and its metrics.json.
+
+Seconds and memory are those of the fit alone. A --budget runs from the start of the process, and the first fit after a
+change of the kernels compiles them. For equal time, fit once before.
 """
 
 from __future__ import annotations
@@ -27,8 +31,9 @@ from typing import Any
 
 from mgavatar.config import read_preset
 from mgavatar.errors import DataError
+from mgavatar.reporting.markdown import markdown_table
 
-# Nothing heavy is imported before the last fit has ended: a child's peak of memory is at least what its parent holds.
+# Nothing heavy is imported before the last fit has ended: a child's peak memory is at least that of its parent.
 
 MGAVATAR = (sys.executable, "-c", "from mgavatar.cli import main; main()")
 Row = dict[str, Any]
@@ -36,7 +41,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Options:
-    """What all cells have in common."""
+    """Settings that all cells share."""
 
     out: Path
     seeds: Sequence[int] = (0,)
@@ -47,7 +52,10 @@ class Options:
 
 @dataclass(frozen=True)
 class Cell:
-    """One preset on one capture from one seed."""
+    """One preset on one capture from one seed.
+
+    The properties name the places of its files.
+    """
 
     preset: str
     data: Path
@@ -80,7 +88,7 @@ class Cell:
         return self.run / "summary.json"
 
     def conditions(self) -> dict[str, Any]:
-        """What a cell that is there already must have been made with."""
+        """Return the conditions that an existing cell must have been made under."""
         return {
             "preset": read_preset(self.preset),
             "data": str(self.data.resolve()),
@@ -105,7 +113,7 @@ class Cell:
 
 
 def plan_cells(presets: Sequence[str], captures: Sequence[str], options: Options) -> list[Cell]:
-    """All cells, capture by capture, after checking what can be checked without work.
+    """Return all cells, capture by capture, after the checks that need no work.
 
     Raises:
         DataError: If a preset or a folder does not exist, two have one name, or --out has cells of other conditions.
@@ -118,7 +126,7 @@ def plan_cells(presets: Sequence[str], captures: Sequence[str], options: Options
         Cell(preset, data, head, seed, options) for data, head in places for preset in presets for seed in options.seeds
     ]
     if len({cell.folder for cell in cells}) < len(cells):
-        raise DataError("two captures, presets or seeds have one name; give each a name of its own")
+        raise DataError("two captures, presets or seeds share a name; give each a name of its own")
     for cell in cells:
         if not (cell.data / "transforms_train.json").is_file():
             raise DataError(f"{cell.data}: no transforms_train.json in this folder; give the folder of a capture")
@@ -126,12 +134,15 @@ def plan_cells(presets: Sequence[str], captures: Sequence[str], options: Options
             raise DataError(f"{cell.head_model}: no such file; give the head model of {cell.data}")
         noted, conditions = cell.folder / "cell.json", cell.conditions()
         if noted.is_file() and json.loads(noted.read_text("utf-8")) != conditions:
-            raise DataError(f"{cell.folder}: was made under other conditions; give another --out, or remove it")
+            raise DataError(f"{cell.folder}: was made under other conditions; give another --out, or remove the folder")
     return cells
 
 
 def run_command(command: Sequence[str], log: Path) -> int:
-    """Run mgavatar, its words into a file; Ctrl-C is passed on once, so that a fit can save itself."""
+    """Run mgavatar with its output in a file and return its exit code.
+
+    Ctrl-C is passed on once, so that a fit can save its checkpoint.
+    """
     with log.open("ab") as file:
         file.write(f"$ mgavatar {' '.join(command)}\n".encode())
         file.flush()
@@ -147,7 +158,7 @@ def run_command(command: Sequence[str], log: Path) -> int:
 
 
 def complete(cell: Cell) -> str | None:
-    """Do what is left to do of a cell; the reason if that fails."""
+    """Do the remaining work of a cell; return the reason if it fails."""
     if cell.metrics.is_file() and not _lacks_lpips(cell):
         return None
     cell.folder.mkdir(parents=True, exist_ok=True)
@@ -175,7 +186,7 @@ def _last_line(log: Path) -> str:
 
 
 def row_of(cell: Cell, failure: str | None) -> Row:
-    """Everything about a cell that the table shows; a failed one has only its reason."""
+    """Collect the values of a cell that the table shows; a failed cell has only its reason."""
     row: Row = {"capture": cell.capture, "preset": cell.preset, "seed": cell.seed, "failure": failure}
     if failure is not None:
         return row
@@ -214,15 +225,14 @@ _COLUMNS: tuple[tuple[str, tuple[str, ...], str], ...] = (
 
 
 def table(rows: Sequence[Row], options: Options) -> str:
-    """The means over the seeds in Markdown, with their standard deviations and, in brackets, the differences."""
+    """Return the means over the seeds in Markdown, with standard deviations and, in brackets, differences."""
     budget = f"budget {options.budget}" if options.budget else "no budget"
     seeds = f"Seed {options.seeds[0]}, {budget}."
     if len(options.seeds) > 1:
         listed = ", ".join(map(str, options.seeds))
         seeds = f"Means over seeds {listed}, {budget}; after ± the standard deviation of a single fit."
-    titles = ["capture", "preset", *(title for title, _, _ in _COLUMNS), "iterations"]
-    lines = [f"{seeds} In brackets: difference to the first preset of the capture.", ""]
-    lines += ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
+    header = ["capture", "preset", *(title for title, _, _ in _COLUMNS), "iterations"]
+    lines = []
     firsts: dict[str, list[Row]] = {}
     for (capture, preset), group in _grouped(rows).items():
         done = [row for row in group if row["failure"] is None]
@@ -234,12 +244,13 @@ def table(rows: Sequence[Row], options: Options) -> str:
             cells.append(" + ".join(f"{fmean(count):,.0f}" for count in counts))
         else:
             cells += ["failed"] + [""] * len(_COLUMNS)
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *(f"* {note}" for note in _notes(rows)), ""])
+        lines.append(cells)
+    introduction = f"{seeds} In brackets: difference to the first preset of the capture."
+    return "\n".join([introduction, "", markdown_table(header, lines), "", *(f"* {note}" for note in _notes(rows)), ""])
 
 
 def _grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    """The seeds of every preset on every capture."""
+    """Group the seeds of every preset on every capture."""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["capture"], row["preset"]), []).append(row)
@@ -247,7 +258,7 @@ def _grouped(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 
 
 def _notes(rows: Sequence[Row]) -> list[str]:
-    """What failed, and why there is no LPIPS; each once."""
+    """List the failures and the reasons for missing LPIPS, each once."""
     notes: dict[str, None] = {}
     for row in rows:
         if row["failure"] is not None:
@@ -280,14 +291,14 @@ def _at(row: Row, path: tuple[str, ...]) -> Any:
 
 
 def write_table(rows: Sequence[Row], options: Options) -> None:
-    """``table.json`` and ``table.md``."""
+    """Write ``table.json`` and ``table.md``."""
     conditions = {"seeds": list(options.seeds), "budget": options.budget, "device": options.device}
     (options.out / "table.json").write_text(json.dumps({**conditions, "rows": rows}, indent=1) + "\n", "utf-8")
     (options.out / "table.md").write_text(table(rows, options), "utf-8")
 
 
 def write_sheet(cells: Sequence[Cell], options: Options) -> None:
-    """``sheet.png``: what the finished cells of the first seed look like."""
+    """Write ``sheet.png`` with held-out frames of the finished cells of the first seed."""
     from ablate_sheet import contact_sheet
     from PIL import Image
 
@@ -300,7 +311,7 @@ def write_sheet(cells: Sequence[Cell], options: Options) -> None:
 
 
 def ablate(presets: Sequence[str], captures: Sequence[str], options: Options) -> int:
-    """Complete all cells and write what they show; the number of those that failed."""
+    """Complete all cells, write their results and return the number of those that failed."""
     cells = plan_cells(presets, captures, options)
     options.out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -316,13 +327,19 @@ def ablate(presets: Sequence[str], captures: Sequence[str], options: Options) ->
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """0 done, 1 a cell failed or something is missing, 2 the command line is wrong, 130 interrupted."""
+    """Run the command line.
+
+    Returns:
+        0 done, 1 a cell failed or a file is missing, 2 the command line is wrong, 130 interrupted.
+    """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--presets", nargs="+", required=True, help="as in fit; the first is compared with")
-    parser.add_argument("--captures", nargs="+", required=True, metavar="DIR[:HEAD]", help="and their head models")
+    parser.add_argument("--presets", nargs="+", required=True, help="as in fit; the others are compared with the first")
+    parser.add_argument(
+        "--captures", nargs="+", required=True, metavar="DIR[:HEAD]", help="captures with their head models"
+    )
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="each cell once from each of them")
-    parser.add_argument("--budget", help="of each fit, as in fit")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0], help="seeds to fit each preset from")
+    parser.add_argument("--budget", help="time of each fit, as in fit")
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
     parser.add_argument("--lpips-weights", type=Path)
     given = vars(parser.parse_args(argv))
@@ -332,7 +349,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"ablate: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("ablate: interrupted; the same command goes on", file=sys.stderr)
+        print("ablate: interrupted; the same command continues", file=sys.stderr)
         return 130
 
 

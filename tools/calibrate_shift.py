@@ -1,14 +1,16 @@
-"""How far behind the surface Gaussians have to be drawn, from a ball of known radius: a table of docs/geometry.md.
+"""Calibrate how far behind the surface Gaussians are drawn, on a ball of known radius (docs/lab/geometry.md).
 
-A ball is photographed from a ring of cameras, as a plain disc or with a texture, and vertex-bound Gaussians on an
-icosphere learn its radius (and, on the texture, their colours) from the photometric loss of Eq. 4 alone, drawn behind
-their vertices as the geometry stage draws them. The table has what is left of the radius' error at several shifts.
+    python tools/calibrate_shift.py
 
-python tools/calibrate_shift.py
+A ball is photographed from a ring of cameras, as a plain disc or with a texture. Vertex-bound Gaussians on an icosphere
+learn its radius, and on the texture their colours, from the photometric loss of Eq. 4 alone. They are drawn behind
+their vertices as the geometry stage draws them. The table shows the remaining error of the radius at several shifts.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -21,34 +23,35 @@ from mgavatar.config import ImageLossConfig, RasterConfig
 from mgavatar.gaussians import Gaussians, draw
 from mgavatar.geometry.vertex_gaussians import silhouette_offset
 from mgavatar.losses import image_loss
+from mgavatar.reporting.markdown import markdown_table
 
 RADIUS = 0.1
-"""Of the ball [m]: a head's."""
+"""Radius of the ball [m], about that of a head."""
 DISTANCE = 1.0
-"""Of the cameras from its middle [m]."""
+"""Distance of the cameras from the centre of the ball [m]."""
 SUBDIVISIONS = 4
-"""Of the icosahedron: 2,562 vertices, edges of 6.9 mm."""
+"""Subdivisions of the icosahedron: 2,562 vertices, edges of 6.9 mm."""
 N_CAMERAS = 12
 SHIFTS = (0.0, 1.5, 1.8, 2.0, 2.5)
-"""Values of `geometry.surface_shift`."""
+"""Values of ``geometry.surface_shift``."""
 Surface = Literal["disc", "texture"]
 
 
 def mesh() -> tuple[Tensor, float]:
-    """Unit vertices of the icosphere, shape [V, 3], and the mean length of its edges on the ball [m]."""
+    """Return unit vertices of the icosphere, shape [V, 3], and the mean length of its edges on the ball [m]."""
     ball = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS)
     return torch.tensor(ball.vertices, dtype=torch.float32), RADIUS * float(ball.edges_unique_length.mean())
 
 
 def cameras(focal: float, size: int) -> list[Camera]:
-    """A ring at the height of the ball; ``focal`` and ``size`` in px."""
+    """Return a ring of cameras at the height of the ball; ``focal`` and ``size`` in px."""
     angles = np.linspace(0.0, 2.0 * np.pi, N_CAMERAS, endpoint=False)
     places = DISTANCE * np.stack([np.sin(angles), 0.0 * angles, np.cos(angles)], 1)
     return [look_at(place, np.zeros(3), focal=focal, width=size, height=size) for place in places]
 
 
 def photograph(camera: Camera, surface: Surface, background: Tensor, samples: int = 4) -> Tensor:
-    """The ball as a camera sees it, exact up to ``samples`` squared rays a pixel; shape [3, H, W]."""
+    """Ray-trace the ball with ``samples`` squared rays per pixel; shape [3, H, W]."""
     steps = (np.arange(samples * camera.width) + 0.5) / samples
     pixels = np.stack([*np.meshgrid(steps, steps), np.ones((len(steps), len(steps)))], -1)
     rays = pixels @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
@@ -62,7 +65,7 @@ def photograph(camera: Camera, surface: Surface, background: Tensor, samples: in
 
 
 def pattern(points: np.ndarray, surface: Surface) -> np.ndarray:
-    """Colours of points on the ball, shape [..., 3]: grey, or waves of 26 mm, which three pixels can show."""
+    """Return colours of points on the ball, shape [..., 3]: grey, or waves of 26 mm, which three pixels can show."""
     if surface == "disc":
         return np.full(points.shape, 0.4)
     x, y, z = np.moveaxis(points * (2.0 * np.pi / 0.026), -1, 0)
@@ -71,14 +74,17 @@ def pattern(points: np.ndarray, surface: Surface) -> np.ndarray:
 
 
 def calibrate(sigma: float, edge_px: float, surface: Surface, shift: float, *, iterations: int = 200) -> float:
-    """Fit the radius of the vertices; what it returns is that minus the ball's [m]: negative is inside.
+    """Fit the radius of the vertices and return its error.
 
     Args:
-        sigma: Of the Gaussians, in edges.
+        sigma: Standard deviation of the Gaussians, in edges.
         edge_px: Length of an edge in the images [px].
-        surface: What the ball looks like.
-        shift: The geometry stage's ``surface_shift``.
-        iterations: One image each.
+        surface: Look of the ball.
+        shift: ``surface_shift`` of the geometry stage.
+        iterations: Optimizer steps, one image each.
+
+    Returns:
+        Fitted minus true radius [m], a mean over the last round of cameras. Negative is inside.
     """
     directions, edge = mesh()
     focal = edge_px / edge * DISTANCE
@@ -108,24 +114,16 @@ def calibrate(sigma: float, edge_px: float, surface: Surface, shift: float, *, i
     return float(np.mean(late)) - RADIUS
 
 
-def rows(sigmas: tuple[float, ...], edges_px: tuple[float, ...]) -> list[str]:
-    """The table, line by line."""
-    head = ["sigma / edge", "edge [px]", "surface", *(f"error at {shift:g} [mm]" for shift in SHIFTS)]
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+def table(sigmas: Sequence[float], edges_px: Sequence[float]) -> str:
+    """Fit every combination and return the errors of the radius in a Markdown table."""
+    header = ["sigma / edge", "edge", "surface", *(f"error at {shift:g} [mm]" for shift in SHIFTS)]
     surfaces: tuple[Surface, ...] = ("disc", "texture")
-    for sigma in sigmas:
-        for edge_px in edges_px:
-            for surface in surfaces:
-                errors = [calibrate(sigma, edge_px, surface, shift) for shift in SHIFTS]
-                cells = [f"{sigma:g}", f"{edge_px:g}", surface, *(f"{1e3 * error:+.2f}" for error in errors)]
-                lines.append("| " + " | ".join(cells) + " |")
-    return lines
-
-
-def main() -> None:
-    """Print the table."""
-    print("\n".join(rows((0.25, 0.35, 0.5), (1.5, 3.0, 6.0))))
+    rows = []
+    for sigma, edge_px, surface in itertools.product(sigmas, edges_px, surfaces):
+        errors = [calibrate(sigma, edge_px, surface, shift) for shift in SHIFTS]
+        rows.append([f"{sigma:g}", f"{edge_px:g} px", surface, *(f"{1e3 * error:+.2f}" for error in errors)])
+    return markdown_table(header, rows)
 
 
 if __name__ == "__main__":
-    main()
+    print(table((0.25, 0.35, 0.5), (1.5, 3.0, 6.0)))

@@ -3,7 +3,7 @@
 A stage's schedule (rates, density control) is counted in iterations as configured. Without a budget each iteration
 moves it by one. With one it moves by the share of what is left that an iteration takes of the time that is left, at the
 pace of the last few: the schedule ends with the time, whatever other work does to the machine and however the number of
-Gaussians grows. ``docs/plan.md`` says what that costs.
+Gaussians grows. ``docs/presets-and-budgets.md`` explains it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What of the method a capture needs: every ``auto`` of the configuration settled, each with its reason.
 
-The rules and what they save are in ``docs/plan.md``. A value that the user gave is never touched.
+The rules are explained in ``docs/presets-and-budgets.md``. A value that the user gave is never touched.
 """
 
 from __future__ import annotations
