@@ -205,7 +205,9 @@ def test_a_failed_cell_is_reported_and_the_others_go_on(
     text = (tmp_path / "out/table.md").read_text()
     assert ["bob", "quick", "failed"] in [row[:3] for row in cells_of(text)]
     assert "* bob, quick, seed 0: fit ended with 1: mgavatar: bob.png: is damaged" in text
-    assert "| bob | quick,baseline |" in text  # its reference is missing, its figures are not
+    assert ["bob", "quick,baseline"] in [
+        row[:2] for row in cells_of(text)
+    ]  # its reference is missing, its figures are not
     fake.breaks = lambda command: command[0] == "evaluate"
     assert _run(tmp_path, captures[::-1]) == 1
     assert "evaluate ended with 1" in capsys.readouterr().err
