@@ -1,4 +1,4 @@
-"""Cameras, and the conventions that the whole program follows.
+"""Cameras and the conventions of the whole program.
 
 * World and head: metres, x to the subject's left, y up, z forward (the face looks to +z).
 * Camera: OpenCV axes, x right, y down, z forward; ``viewmat`` maps world to camera.
@@ -31,11 +31,11 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """Camera centre in world space [m], shape [3]."""
+        """Return the camera centre in world space [m], shape [3]."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same view at another image size."""
+        """Return the same view at another image size [px]."""
         factor = np.array([[width / self.width], [height / self.height], [1.0]])
         return Camera(self.viewmat, self.K * factor, width, height)
 
@@ -49,7 +49,16 @@ def look_at(
     height: int,
     up: tuple[float, float, float] = (0.0, 1.0, 0.0),
 ) -> Camera:
-    """A camera at ``position`` [m] that sees ``target`` [m] in the image centre, ``up`` upwards; ``focal`` in px."""
+    """Return a camera that sees a point in its image centre.
+
+    Args:
+        position: Camera centre in world space [m], shape [3].
+        target: Point in the image centre [m], shape [3].
+        focal: Focal length [px].
+        width: Image width [px].
+        height: Image height [px].
+        up: Direction that points upwards in the image, not parallel to the line of sight.
+    """
     forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, np.asarray(up, np.float64))

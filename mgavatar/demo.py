@@ -1,4 +1,4 @@
-"""``mgavatar demo``: the whole way on a synthetic person, from nothing to a driven and scored avatar."""
+"""``mgavatar demo``: a synthetic capture, its avatar, a driven video and scores, from nothing."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ FPS = 25.0
 
 
 def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -> dict[str, Any]:
-    """Make a capture, fit, drive, score and report in a new folder.
+    """Make a capture, fit an avatar to it, drive it, score it and write a report, all in a new folder.
 
     Args:
         out: Folder to make; it gets ``capture``, ``run``, ``driving.npz``, ``driven.mp4`` (or ``.gif`` without PyAV)
             and ``metrics.json``.
-        config: Of the fit.
-        device: Where to compute.
-        seed: Of the person and of the fit.
+        config: Configuration of the fit.
+        device: Device to fit and render on.
+        seed: Seed of the person and of the fit.
 
     Returns:
-        The scores, as ``evaluate`` gives them.
+        The scores, as :func:`mgavatar.scoring.evaluate.evaluate` returns them.
 
     Raises:
         DataError: If ``out`` exists and is not empty.
@@ -68,7 +68,7 @@ def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -
 
 
 def _drive(avatar: Avatar, subject: Subject, out: Path) -> None:
-    """A talking, turning head: a driving file in VHAP's keys, and its film."""
+    """Write a driving sequence in VHAP's keys and render it as a video."""
     path = out / "driving.npz"
     with atomic_write(path) as file:
         np.savez(file, **demo_motion(avatar))  # type: ignore[arg-type]
@@ -78,7 +78,16 @@ def _drive(avatar: Avatar, subject: Subject, out: Path) -> None:
 
 
 def demo_motion(avatar: Avatar) -> dict[str, np.ndarray]:
-    """A loop of speech, smile, blinks, a turning neck and wandering eyes, for the built-in head."""
+    """Return a driving sequence of a person who talks, smiles, blinks, turns and looks around.
+
+    It loops without a jump. Expressions are directions of the built-in head.
+
+    Args:
+        avatar: Avatar whose head model is the built-in one.
+
+    Returns:
+        Parameters of ``DRIVING_FRAMES`` frames in VHAP's keys, with ``fps`` and ``expr_basis``.
+    """
     t = np.linspace(0.0, 2.0 * np.pi, DRIVING_FRAMES, endpoint=False)
     names = avatar.head_model.expr_names
     expr = np.zeros((DRIVING_FRAMES, avatar.head_model.n_expr), np.float32)

@@ -6,7 +6,7 @@ import importlib
 from pathlib import Path
 
 import pytest
-from kernel_style import kernel_names, lint
+from kernel_style import generated_adjoints, kernel_names, lint
 
 import mgavatar.kernels
 
@@ -55,6 +55,13 @@ def test_kernels_keep_the_style(path):
 def test_kernels_are_found():
     """The test above reads something."""
     assert sum(len(kernel_names(path.read_text())) for path in FILES) >= 30
+
+
+def test_only_face_frames_leave_their_adjoint_to_warp():
+    """CONTRIBUTING.md says so, and why."""
+    assert [name for path in FILES for name in generated_adjoints(path.read_text())] == ["face_frames_kernel"]
+    assert generated_adjoints(GOOD) == ["_add_kernel"]
+    assert generated_adjoints(GOOD.replace("@wp.kernel", "@wp.kernel(enable_backward=False)")) == []
 
 
 def test_a_good_kernel_has_no_fault():

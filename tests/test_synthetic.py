@@ -17,6 +17,7 @@ from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
 from mgavatar.errors import DataError
 from mgavatar.head.find import find_head_model
+from mgavatar.head.mesh_math import vertex_normals
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
 from mgavatar.head.procedural.build import build_head
@@ -24,7 +25,7 @@ from mgavatar.kernels.portrait import View, portrait
 from mgavatar.kernels.ray_cast import RayMesh
 from mgavatar.synthetic.capture import make_synthetic_capture
 from mgavatar.synthetic.motion import action_columns, perform
-from mgavatar.synthetic.person import Person, make_person, subdivision, vertex_normals
+from mgavatar.synthetic.person import Person, make_person, subdivision
 from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
 
 SIZE = (48, 40)

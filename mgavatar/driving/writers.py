@@ -26,6 +26,8 @@ from mgavatar.files import one_line
 from mgavatar.kernels.rasterize import Rendering
 
 FileKind = Literal["mp4", "gif", "png", "exr"]
+Format = Literal["auto", "png", "exr", "mp4"]
+"""A kind of file that a user asks for; ``auto`` goes by the name."""
 
 FrameSink = Callable[[Rendering, Camera], None]
 """Takes the next frame; for ``exr`` rendered over black, so that its colours are premultiplied."""
@@ -43,12 +45,12 @@ _TV_RANGE = 1
 
 
 def to_bytes(image: Tensor) -> np.ndarray:
-    """An image [3, H, W] in 0..1 as pixels [H, W, 3], uint8, rounded to the nearest value."""
+    """Return an image [3, H, W] in 0..1 as pixels [H, W, 3], uint8, rounded to the nearest value."""
     return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
-def kind_of(out: Path, format: Literal["auto", "png", "exr", "mp4"] = "auto") -> FileKind:
-    """What to write at ``out``, after checking that it can be written there and what is there may be replaced.
+def kind_of(out: Path, format: Format = "auto") -> FileKind:
+    """Decide what to write at ``out``, and check that it can be written there without harm to other files.
 
     Args:
         out: A name ending in ``.mp4`` or ``.gif``, else a folder.
@@ -97,11 +99,11 @@ def _first_bytes(path: Path) -> bytes:
 
 @contextlib.contextmanager
 def frame_writer(out: Path, kind: FileKind, *, fps: float) -> Iterator[FrameSink]:
-    """Write frames to a name beside ``out``, which takes its place when the block ends without error.
+    """Write frames beside ``out`` and move them there when the block ends without error.
 
     Args:
-        out: Where to write; see :func:`kind_of`.
-        kind: What to write.
+        out: File or folder to write; see :func:`kind_of`.
+        kind: Kind of file.
         fps: Frames per second of a video.
 
     Yields:
@@ -143,11 +145,11 @@ class _Counter:
 
 @contextlib.contextmanager
 def _mp4(path: Path, fps: float) -> Iterator[FrameSink]:
-    """H.264 in yuv420p, which every player takes, with the colours declared as BT.709."""
+    """Write H.264 in yuv420p, which every player can show, with the colours declared as BT.709."""
     import av
     from av.video.reformatter import Interpolation
 
-    # Without these swscale takes shortcuts that cost about half a level of brightness.
+    # Without these flags, swscale rounds in ways that cost about half a level of brightness.
     exact = (
         Interpolation.BICUBIC | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT | Interpolation.FULL_CHR_H_INP
     )
@@ -178,7 +180,7 @@ def _mp4(path: Path, fps: float) -> Iterator[FrameSink]:
 
 
 def _padded_to_even(pixels: np.ndarray) -> np.ndarray:
-    """Repeat the last row and column where yuv420p, which halves both, needs it."""
+    """Repeat the last row and column of odd sizes: yuv420p stores colours at half the size."""
     height, width = pixels.shape[:2]
     return np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -191,7 +193,7 @@ def _gif(path: Path, fps: float) -> Iterator[FrameSink]:
         frames.append(Image.fromarray(to_bytes(rendering.image)).quantize(256, dither=Image.Dither.FLOYDSTEINBERG))
 
     yield add
-    hundredths = max(2, round(100.0 / fps))  # players take shorter ones for 10
+    hundredths = max(2, round(100.0 / fps))  # players show shorter delays as 10 hundredths
     frames[0].save(
         path, format="GIF", save_all=True, append_images=frames[1:], duration=10 * hundredths, loop=0, disposal=1
     )
@@ -226,13 +228,16 @@ def write_exr(path: Path, rendering: Rendering, camera: Camera, *, frame: int) -
     Args:
         path: The file.
         rendering: A frame drawn over black.
-        camera: What it was seen with; goes into the header.
-        frame: Its number; goes into the header.
+        camera: Its camera, for the header.
+        frame: Its number, for the header.
     """
+    import kornia.color
+
     alpha = rendering.alphas.detach().cpu().clamp(0.0, 1.0)
     covered = alpha > 1e-4
     divisor = torch.where(covered, alpha, 1.0)
-    linear = srgb_to_linear((rendering.image.detach().cpu() / divisor).clamp(0.0, 1.0)) * alpha
+    display = (rendering.image.detach().cpu() / divisor).clamp(0.0, 1.0)
+    linear = kornia.color.rgb_to_linear_rgb(display) * alpha
     rgba = torch.cat([linear, alpha[None]]).where(covered, 0.0).permute(1, 2, 0).half()
     depth = torch.where(covered, rendering.depths.detach().cpu() / divisor, EMPTY_DEPTH).float()
     channels = {"RGBA": rgba.contiguous().numpy(), "Z": depth.contiguous().numpy()}
@@ -259,11 +264,3 @@ def _exr_header(camera: Camera, frame: int) -> dict[str, Any]:
         "mgavatar/version": __version__,
         "mgavatar/json": json.dumps(notes),
     }
-
-
-def srgb_to_linear(color: Tensor) -> Tensor:
-    """The sRGB transfer function (IEC 61966-2-1), from display to scene values."""
-    return torch.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
-
-
-Format = Literal["auto", "png", "exr", "mp4"]

@@ -14,6 +14,7 @@ from mgavatar.head.params import Pose
 from mgavatar.head.subdivide import subdivide
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
+from mgavatar.kernels.mesh_geometry import corner_sum, vertex_edge_lengths, vertex_normals
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 
@@ -62,11 +63,8 @@ class Body:
         return laplacian_matrix(self.faces, self.n_verts).to(self.device)
 
     @cached_property
-    def _corner_sum(self) -> SparseMatrix:
-        corners = self.faces.reshape(-1).long().cpu()
-        n_faces = len(self.faces)
-        columns = torch.arange(n_faces).repeat_interleave(3)
-        return SparseMatrix.from_coo(corners, columns, torch.ones(3 * n_faces), (self.n_verts, n_faces)).to(self.device)
+    def _corners(self) -> SparseMatrix:
+        return corner_sum(self.faces, self.n_verts)
 
     def carry(self, values: Tensor) -> Tensor:
         """Per-vertex values of the base mesh, carried to the fine one; shape [V_base, C] to [V, C]."""
@@ -100,19 +98,12 @@ class Body:
         return skin(verts + self.carry(moved), self.lbs_weights, transforms) + pose.translation
 
     def normals(self, verts: Tensor) -> Tensor:
-        """Unit vertex normals, areas as weights, shape [V, 3]; zero where a vertex has no face. No gradient."""
-        with torch.no_grad():
-            a, b, c = verts[self.faces.long()].unbind(1)
-            normals = sparse_apply(self._corner_sum, torch.cross(b - a, c - a, dim=1))
-            return torch.nn.functional.normalize(normals, dim=1)
+        """Return unit vertex normals, shape [V, 3]; zero where a vertex has no face. No gradient."""
+        return vertex_normals(verts, self.faces, corners=self._corners)
 
     def edge_lengths(self, verts: Tensor) -> Tensor:
-        """Mean length of the edges at each vertex [m], shape [V]. No gradient."""
-        with torch.no_grad():
-            a, b, c = verts[self.faces.long()].unbind(1)
-            mean = ((b - a).norm(dim=1) + (c - b).norm(dim=1) + (a - c).norm(dim=1)) / 3
-            total = sparse_apply(self._corner_sum, torch.stack([mean, torch.ones_like(mean)], 1))
-            return total[:, 0] / total[:, 1].clamp(min=1.0)
+        """Return the mean length of the edges around each vertex [m], shape [V]. No gradient."""
+        return vertex_edge_lengths(verts, self.faces, corners=self._corners)
 
 
 def _subdivided(model: HeadModel, times: int) -> tuple[HeadModel, list[SparseMatrix]]:

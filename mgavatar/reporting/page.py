@@ -58,7 +58,7 @@ class _Card:
 
 @dataclass(frozen=True)
 class _Table:
-    """A table of text; ``kind`` is ``numbers`` (to the right) or ``words`` (to the left, broken anywhere)."""
+    """A table of text. Its ``kind`` is ``numbers``, ``words``, or ``words facts``, where long values may be broken."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -230,7 +230,7 @@ def _cards(avatar: Avatar, metrics: dict[str, Any] | None, stages: dict[str, lis
         cards.append(_Card(_number(1e3 * metrics["seconds_per_frame"], 0, " ms"), f"per frame, on {metrics['device']}"))
     seconds = sum(float(lines[-1].get("seconds", 0.0)) for lines in stages.values() if lines)
     if seconds:
-        cards.append(_Card(duration(seconds), "of iterations"))
+        cards.append(_Card(duration(seconds), "spent in iterations"))
     return cards
 
 
@@ -248,7 +248,7 @@ def _geometry_tables(geometry: dict[str, Any]) -> list[_Table]:
     """Return the scores by region, then those of the scored region by parts of the fit."""
     numbers = ["mean [mm]", "median [mm]", "95th percentile [mm]", "normals [°]"]
     regions = [["scored region", *_distances(geometry)]]
-    regions += [[name, *_distances(scores)] for name, scores in geometry["regions"].items()]
+    regions += [[name.replace("_", " "), *_distances(scores)] for name, scores in geometry["regions"].items()]
     steps = [[_STEPS[name], *_distances(scores), *_folds(scores)] for name, scores in geometry["steps"].items()]
     steps.append(["neutral head", "", "", "", "", *_folds(geometry)])
     folds = ["flipped faces", "crossing faces", "new crossings"]
@@ -284,7 +284,7 @@ def _provenance(avatar: Avatar, subject: Subject) -> _Table:
         ["Libraries", libraries],
         ["Machine", f"Python {platform.python_version()}, {platform.system()} {platform.machine()}, {avatar.device}"],
     ]
-    return _Table(["what", "value"], rows, kind="words")
+    return _Table(["what", "value"], rows, kind="words facts")
 
 
 def config_changes(config: FitConfig) -> Iterable[list[str]]:

@@ -17,9 +17,10 @@ from mgavatar.capture.subject import Frame, Subject
 from mgavatar.driving.cameras import turned_cameras
 from mgavatar.driving.writers import to_bytes
 from mgavatar.head.params import Pose
+from mgavatar.kernels.mesh_geometry import vertex_normals
 from mgavatar.kernels.ray_cast import RayMesh, camera_rays
 from mgavatar.scoring.evaluate import evaluation_pose, spread
-from mgavatar.scoring.geometry import tracked_shape, vertex_normals
+from mgavatar.scoring.geometry import tracked_shape
 
 ERROR_GAIN = 4
 SIDE_DEGREES = 60.0
@@ -89,7 +90,7 @@ def normal_picture(verts: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
     _, face_ids, weights = RayMesh(verts, faces).cast(origins, directions)
     hit = face_ids >= 0
     corners = faces.long()[face_ids.clamp(min=0).long()]
-    normals = vertex_normals(verts.cpu(), faces.long().cpu()).to(device)
+    normals = vertex_normals(verts, faces)
     smooth = torch.nn.functional.normalize((normals[corners] * weights[:, :, None]).sum(1), dim=1)
     in_camera = smooth @ viewmat[:3, :3].T.float() * torch.tensor([1.0, -1.0, -1.0], device=device)
     colors = (0.5 + 0.5 * in_camera).where(in_camera[:, 2:] > 0, torch.tensor(_BACK, device=device))

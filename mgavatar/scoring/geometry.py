@@ -14,6 +14,7 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
 from mgavatar.head.params import Pose, pad_or_truncate
 from mgavatar.kernels.closest_point import closest_points
+from mgavatar.kernels.mesh_geometry import face_normals, vertex_normals
 from mgavatar.kernels.self_intersection import crossing_faces
 from mgavatar.scoring.truth import Truth
 
@@ -185,22 +186,6 @@ def _compare(verts: Tensor, faces: Tensor, points: Tensor, point_faces: Tensor) 
     cosine = (normals * truth_normals).sum(1).clamp(-1.0, 1.0)
     angle = torch.acos(cosine).where(known, torch.nan)
     return distance.cpu().numpy(), angle.cpu().numpy()
-
-
-def face_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return unit normals of faces, shape [F, 3]; zero where a face has no area."""
-    a, b, c = verts[faces.long()].unbind(1)
-    return torch.nn.functional.normalize(torch.cross(b - a, c - a, dim=1), dim=1, eps=1e-30)
-
-
-def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
-    """Return unit normals of vertices, weighted by face area, shape [V, 3]; zero where a vertex has no face."""
-    a, b, c = verts[faces].unbind(1)
-    doubled = torch.cross(b - a, c - a, dim=1)
-    total = torch.zeros_like(verts)
-    for corner in range(3):
-        total.index_add_(0, faces[:, corner], doubled)
-    return torch.nn.functional.normalize(total, dim=1, eps=1e-30)
 
 
 def _flipped_faces(verts: Tensor, reference: Tensor, faces: Tensor) -> int:

@@ -9,6 +9,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mgavatar.head.mesh_math import vertex_normals
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
 from mgavatar.head.subdivide import split_faces
@@ -215,15 +216,6 @@ def comb(
     hang = fall * cover * _ramp(-y, -0.05, 0.08) * _ramp(np.abs(around), 1.3, 2.1)
     offsets += hang[:, None] * (np.array([0.0, -1.0, 0.0]) + 0.35 * outward) * (0.8 + 0.4 * clumps)[:, None]
     return cover, offsets
-
-
-def vertex_normals(verts: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals weighted by area, shape [V, 3]."""
-    a, b, c = verts[faces[:, 0]], verts[faces[:, 1]], verts[faces[:, 2]]
-    areas = np.cross(b - a, c - a)
-    rows, columns = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    normals = sp.csr_matrix((np.ones(len(rows)), (rows, columns)), (len(verts), len(faces))) @ areas
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def _ramp(x: np.ndarray, low: float, high: float) -> np.ndarray:

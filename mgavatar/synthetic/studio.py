@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from mgavatar.camera import Camera, look_at
+from mgavatar.head.mesh_math import vertex_normals
 from mgavatar.head.params import HeadParams
 from mgavatar.kernels.portrait import N_SAMPLES, Look, View, portrait
 from mgavatar.kernels.ray_cast import RayMesh, camera_rays
-from mgavatar.synthetic.person import Person, vertex_normals
+from mgavatar.synthetic.person import Person
 
 _DISTANCE = 1.0
 _TARGET = np.array([0.0, -0.035, -0.02])

@@ -40,6 +40,18 @@ def kernel_names(source: str) -> list[str]:
     return [node.name for node in nodes if isinstance(node, ast.FunctionDef) and _decorated(node, "kernel")]
 
 
+def generated_adjoints(source: str) -> list[str]:
+    """List the kernels of one file whose adjoint Warp derives: those that do not switch it off."""
+    tree = ast.parse(source)
+    calls = [node.value for node in tree.body if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)]
+    if any(
+        "set_module_options" in ast.unparse(call) and "'enable_backward': False" in ast.unparse(call) for call in calls
+    ):
+        return []
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and _decorated(node, "kernel")]
+    return [node.name for node in nodes if "enable_backward=False" not in ast.unparse(node.decorator_list[0])]
+
+
 def written_arrays(name: str, device: Mapping[str, ast.FunctionDef], snippets: Mapping[str, str]) -> set[str]:
     """Name the parameters of a device function that it writes to, by itself or through the functions that it calls."""
     node = device[name]

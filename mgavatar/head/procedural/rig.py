@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from mgavatar.head.mesh_math import vertex_normals
 from mgavatar.head.procedural import surface as form
 from mgavatar.head.procedural.mesh import HeadMesh
 from mgavatar.head.procedural.sheet import RED_RINGS
@@ -25,13 +26,6 @@ def both_sides(mesh: HeadMesh, group: str) -> Array:
     """Ids of a group of the left half and of its mirror image."""
     ids = mesh.groups[group]
     return np.unique(np.concatenate([ids, mesh.mirror[ids]]))
-
-
-def vertex_normals(verts: Array, faces: Array) -> Array:
-    """Area-weighted unit normals, shape [V, 3]."""
-    cross = np.cross(verts[faces[:, 1]] - verts[faces[:, 0]], verts[faces[:, 2]] - verts[faces[:, 0]])
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), len(verts)) for k in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def _neighbours(mesh: HeadMesh) -> csr_matrix:

@@ -22,6 +22,36 @@ def laplacian(faces: Tensor, x: Tensor) -> Tensor:
     return torch.stack(rows)
 
 
+def face_normals(verts: Tensor, faces: Tensor) -> Tensor:
+    """Cross product of two edges over its length, face after face; zero where it has none."""
+    normals = []
+    for i, j, k in faces.tolist():
+        across = torch.linalg.cross(verts[j] - verts[i], verts[k] - verts[i])
+        normals.append(across / across.norm() if across.norm() > 1e-18 else 0 * across)
+    return torch.stack(normals)
+
+
+def vertex_normals(verts: Tensor, faces: Tensor) -> Tensor:
+    """Sum of the adjacent faces' normals times their areas, over its length; zero where there is no face."""
+    sums = [torch.zeros(3, dtype=verts.dtype) for _ in verts]
+    for face in faces.tolist():
+        a, b, c = verts[face]
+        for i in face:
+            sums[i] = sums[i] + torch.linalg.cross(b - a, c - a)
+    return torch.stack([s / s.norm() if s.norm() > 1e-18 else s for s in sums])
+
+
+def vertex_edge_lengths(verts: Tensor, faces: Tensor) -> Tensor:
+    """Mean over a vertex's faces of the mean of their three edges; zero where there is no face."""
+    lengths: list[list[Tensor]] = [[] for _ in verts]
+    for face in faces.tolist():
+        a, b, c = verts[face]
+        mean = ((b - a).norm() + (c - b).norm() + (a - c).norm()) / 3
+        for i in face:
+            lengths[i].append(mean)
+    return torch.stack([torch.stack(near).mean() if near else verts.new_zeros(()) for near in lengths])
+
+
 def blend_shapes(v_template: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
     """Template plus weighted directions."""
     return v_template + torch.einsum("k,kvc->vc", coeffs, dirs)
