@@ -189,8 +189,8 @@ def test_arrays_that_lie(file, data, words):
         (Select(Ch(np.zeros(3)), np.array([0, 1]), (7,)), "damaged"),
         (Ch(Ch(Ch(Ch(Ch(Ch(Ch(Ch(np.zeros(1))))))))), "wrapped too deep"),
         (Ch("no array"), "unexpected"),
-        ([1, "two"], "something else than integers"),
-        ([[1, 2], [3, 4]], "something else than integers"),
+        ([1, "two"], "something other than integers"),
+        ([[1, 2], [3, 4]], "something other than integers"),
     ],
     ids=lambda value: value if isinstance(value, str) else type(value).__name__,
 )

@@ -1,4 +1,4 @@
-"""A head model as tensors on a device: shape it, express it, pose it."""
+"""A head model as tensors on a device, ready to be shaped, expressed and posed."""
 
 from __future__ import annotations
 
@@ -19,11 +19,25 @@ from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 
 class Body:
-    """The subdivided head. Directions are linear, so they are evaluated on the base mesh and then carried over.
+    """A subdivided head.
+
+    Directions are linear, and so is subdivision: directions are evaluated on the base mesh, and their sum is then
+    interpolated to the fine mesh, which is the same on a quarter of the vertices.
 
     Attributes:
-        model: The head model as given.
-        fine: The same after subdivision, without its directions.
+        model: The head model as given, the base mesh.
+        subdivisions: Number of midpoint subdivisions.
+        device: Device of all tensors but ``parents``.
+        fine: The head model after subdivision, without its directions.
+        v_template: Rest vertices of the base mesh [m], shape [V_base, 3].
+        shape_dirs: Identity directions [m per unit], shape [n_shape, V_base, 3].
+        expr_dirs: Expression directions [m per unit], shape [n_expr, V_base, 3].
+        pose_dirs: Pose correctives [m], shape [36, V_base, 3].
+        has_pose_dirs: False if all pose correctives are zero.
+        J_regressor: Joints from shaped vertices of the base mesh, shape [5, V_base].
+        parents: Parent of each joint, -1 for the root, shape [5], int32, on the CPU.
+        lbs_weights: Skinning weights of the fine mesh, shape [V, 5].
+        faces: Vertex indices of the fine mesh, shape [F, 3], int32.
     """
 
     def __init__(self, model: HeadModel, *, subdivisions: int, device: torch.device | str = "cpu") -> None:
@@ -46,7 +60,7 @@ class Body:
         self.pose_dirs = self._tensor(np.moveaxis(model.posedirs, 2, 0))
         self.has_pose_dirs = bool(np.any(model.posedirs))
         self.J_regressor = self._tensor(model.J_regressor)
-        self.parents = torch.tensor(model.parents, dtype=torch.int32)  # read by the host
+        self.parents = torch.tensor(model.parents, dtype=torch.int32)  # only the host reads it
         self.lbs_weights = self._tensor(self.fine.lbs_weights)
         self.faces = torch.tensor(self.fine.faces, dtype=torch.int32, device=self.device)
 
@@ -55,11 +69,12 @@ class Body:
 
     @property
     def n_verts(self) -> int:
+        """Return the number of vertices of the fine mesh, V."""
         return len(self.fine.v_template)
 
     @cached_property
     def laplacian(self) -> SparseMatrix:
-        """Neighbour-mean Laplacian of the fine mesh."""
+        """Build the neighbour-mean Laplacian of the fine mesh, shape [V, V]."""
         return laplacian_matrix(self.faces, self.n_verts).to(self.device)
 
     @cached_property
@@ -67,17 +82,32 @@ class Body:
         return corner_sum(self.faces, self.n_verts)
 
     def carry(self, values: Tensor) -> Tensor:
-        """Per-vertex values of the base mesh, carried to the fine one; shape [V_base, C] to [V, C]."""
+        """Interpolate per-vertex values of the base mesh to the fine one: shape [V_base, C] to [V, C]."""
         for step in self._subdivision:
             values = sparse_apply(step, values)
         return values
 
     def shaped(self, betas: Tensor) -> Tensor:
-        """The neutral head of an identity, ``T{beta}`` of Section 3.1; [n_shape] to [V, 3], metres."""
+        """Return the neutral head of an identity, ``T{beta}`` of Section 3.1.
+
+        Args:
+            betas: Identity coefficients, shape [n_shape].
+
+        Returns:
+            Vertices [m], shape [V, 3].
+        """
         return self.carry(blend_shapes(self.v_template, self.shape_dirs, betas))
 
     def joints(self, canonical: Tensor) -> Tensor:
-        """Joints of a canonical head [m], shape [5, 3]; identity offsets move them, as in VHAP."""
+        """Regress the joints of a canonical head.
+
+        Args:
+            canonical: Neutral vertices with identity offsets, which move the joints as in VHAP [m], shape [V, 3].
+
+        Returns:
+            Rest joints [m], shape [5, 3].
+        """
+        # Subdivision keeps the base vertices and puts them first.
         return self.J_regressor @ canonical[: len(self.v_template)]
 
     def posed(self, verts: Tensor, pose: Pose, *, joints: Tensor) -> Tensor:
@@ -98,22 +128,23 @@ class Body:
         return skin(verts + self.carry(moved), self.lbs_weights, transforms) + pose.translation
 
     def normals(self, verts: Tensor) -> Tensor:
-        """Return unit vertex normals, shape [V, 3]; zero where a vertex has no face. No gradient."""
+        """Return unit vertex normals, shape [V, 3], zero at vertices without a face; they have no gradient."""
         return vertex_normals(verts, self.faces, corners=self._corners)
 
     def edge_lengths(self, verts: Tensor) -> Tensor:
-        """Return the mean length of the edges around each vertex [m], shape [V]. No gradient."""
+        """Return the mean length of the edges around each vertex [m], shape [V]; it has no gradient."""
         return vertex_edge_lengths(verts, self.faces, corners=self._corners)
 
 
 def _subdivided(model: HeadModel, times: int) -> tuple[HeadModel, list[SparseMatrix]]:
-    """The fine mesh without its directions, and the matrices that carry vertices to it one step at a time."""
+    """Return the fine mesh without its directions, and the matrix of each subdivision, [V_fine, V_coarse]."""
     fine = replace(model, shapedirs=model.shapedirs[:, :, :0], posedirs=model.posedirs[:, :, :0], n_shape=0, n_expr=0)
     steps = []
     for _ in range(times):
         n_verts = len(fine.v_template)
         fine, parents = subdivide(fine)
         rows = torch.arange(len(parents)).repeat_interleave(2)
+        # A base vertex is its own parent twice: its two halves add up to one.
         columns, halves = torch.from_numpy(parents.reshape(-1)), torch.full((len(rows),), 0.5)
         steps.append(SparseMatrix.from_coo(rows, columns, halves, (len(parents), n_verts)))
     return fine, steps

@@ -1,8 +1,8 @@
-"""FLAME's pickles, read without chumpy and without running anything that a pickle asks to run.
+"""FLAME's pickles, read without chumpy and without running code that a pickle names.
 
-A pickle is a program that may name any Python function. Here every name that it may use stands for an inert record
-that notes what it was given; arrays are built afterwards from checked bytes. So numpy's and scipy's own unpickling
-code never sees the file either: a forged type there could address memory at will.
+A pickle is a program that may call any Python function. Here, each name that it may use stands for an inert record of
+its arguments, and arrays are built afterwards from checked bytes. The unpickling code of numpy and scipy never sees the
+file either: a forged type could make it read or write any memory.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from mgavatar.errors import DataError
 from mgavatar.files import GIBIBYTE, one_line, read_bytes
 
 MAX_DEPTH = 6
-"""How deep arrays may be wrapped (chumpy objects in chumpy objects); FLAME's files need 3."""
+"""Largest depth of arrays in arrays (chumpy objects in chumpy objects); FLAME's files need 3."""
 MAX_DENSE = 50_000_000
-"""Most elements of a sparse matrix once it is written out."""
+"""Largest number of elements of a sparse matrix after it has been made dense."""
 PLAIN_TYPES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 
 
 class _Record:
-    """Stands for an object of a pickle: keeps what it was made from and given, and does nothing else."""
+    """An inert stand-in for an object of a pickle: it keeps its arguments and its state."""
 
     args: tuple[Any, ...]
     state: Any
@@ -43,7 +43,7 @@ class _Record:
 
 
 class _Array(_Record):
-    """``numpy.ndarray`` as a name, and what ``_reconstruct`` makes."""
+    """``numpy.ndarray``, by its name or made by ``_reconstruct``."""
 
 
 class _FromBuffer(_Record):
@@ -59,7 +59,7 @@ class _Dtype(_Record):
 
 
 class _Encoded(_Record):
-    """Bytes, as protocols 0 to 2 of Python 3 write them."""
+    """Bytes in the form of protocols 0 to 2 of Python 3."""
 
 
 class _Sparse(_Record):
@@ -75,11 +75,11 @@ class _Select(_Record):
 
 
 class _Other(_Record):
-    """Allowed and of no interest: ``set`` and ``object``."""
+    """``set`` and ``object``, which FLAME's files contain beside the arrays."""
 
 
 class _Reconstructor(_Record):
-    """``copyreg._reconstructor(cls, base, state)``, how protocols 0 and 1 make objects: an empty ``cls``."""
+    """``copyreg._reconstructor(cls, base, state)``, with which protocols 0 and 1 make an empty ``cls``."""
 
     def __new__(cls, *args: Any) -> Any:
         target = args[0] if args else None
@@ -112,11 +112,14 @@ _ALLOWED: dict[tuple[str, str], type[_Record]] = {
 
 
 class _RefusedError(Exception):
-    """The pickle names something that is not in the list."""
+    """A name in the pickle that is not allowed."""
 
 
 class _InertUnpickler(pickle._Unpickler):
-    """Python's own unpickler in Python: the C one takes 8 bytes of memory for every number that a file makes up."""
+    """Python's unpickler written in Python.
+
+    The one in C allocates 8 bytes times the largest memo index in the file, which may be any number.
+    """
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
 
@@ -130,13 +133,13 @@ class _InertUnpickler(pickle._Unpickler):
 
 
 def _load_bytearray(unpickler: Any) -> None:
-    """The original makes room for the length that the file claims; this one reads what is there."""
+    """Read a bytearray without first allocating the length that the file claims."""
     length = int.from_bytes(unpickler.read(8), "little")
     unpickler.append(bytearray(unpickler.read(length)))
 
 
 def _with_plain_keys(opcode: bytes, keys: Callable[[list[Any]], list[Any]]) -> None:
-    """Let ``opcode`` hash only plain values: the hash of a tuple nested a million deep overflows the C stack."""
+    """Let ``opcode`` hash only text and numbers: hashing a tuple nested a million deep overflows the C stack."""
     original = pickle._Unpickler.dispatch[opcode[0]]
 
     def load(unpickler: Any) -> None:
@@ -156,20 +159,20 @@ _with_plain_keys(pickle.FROZENSET, lambda stack: stack)
 
 
 def read_flame_pickle(path: Path, *, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of a pickled dictionary, as FLAME's model and mask files are.
+    """Read the arrays of a pickled dictionary, the form of FLAME's model and mask files.
 
-    Pickles of Python 2 and of protocols 0 to 5; arrays of numpy, ``chumpy.ch.Ch`` and ``chumpy.reordering.Select``,
-    ``scipy.sparse.csc_matrix`` (returned dense) and flat lists of integers.
+    Pickles may be those of Python 2 and of protocols 0 to 5. Arrays may be numpy's, ``chumpy.ch.Ch``,
+    ``chumpy.reordering.Select``, ``scipy.sparse.csc_matrix`` (returned dense) and flat lists of integers.
 
     Args:
         path: The ``.pkl`` file.
-        keys: Entries to return where present; all that are arrays when None.
+        keys: Entries to return if they are present; None returns every array.
 
     Returns:
-        Arrays of plain numbers by their key.
+        Arrays of plain numbers by their keys.
 
     Raises:
-        DataError: If the file is no such pickle, is damaged, or names anything else.
+        DataError: If the file is not such a pickle, is damaged, or names anything else.
     """
     data = read_bytes(path, max_bytes=GIBIBYTE)
     try:
@@ -179,7 +182,7 @@ def read_flame_pickle(path: Path, *, keys: Collection[str] | None = None) -> dic
             f"{path}: refused, because it asks for {one_line(error)}, which no FLAME file needs; "
             "take the file from FLAME's own download, or save its arrays as .npz"
         ) from error
-    except Exception as error:  # whatever a damaged program makes the interpreter of pickles raise
+    except Exception as error:  # a damaged pickle can raise anything
         raise DataError(f"{path}: not a readable pickle ({one_line(error) or type(error).__name__})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a {one_line(type(content).__name__)}, FLAME's files hold a dictionary")
@@ -199,12 +202,12 @@ def _arrays_of(content: dict[Any, Any], *, path: Path, keys: Collection[str] | N
 
 
 def _array(value: Any, *, depth: int) -> np.ndarray:
-    """The array that a record or a list of integers describes."""
+    """Build the array that a record or a list of integers describes."""
     if depth > MAX_DEPTH:
         raise ValueError("arrays are wrapped too deep")
     if isinstance(value, list):
         if not all(isinstance(item, int) for item in value):
-            raise ValueError("a list holds something else than integers")
+            raise ValueError("a list holds something other than integers")
         return np.array(value, np.int64)
     if isinstance(value, _Array):
         return _plain_array(value)
@@ -224,7 +227,7 @@ def _array(value: Any, *, depth: int) -> np.ndarray:
 
 
 def _fields(record: _Record) -> dict[str, Any]:
-    """Attributes that an object was given: a dictionary, or one with a second for ``__slots__``."""
+    """Return an object's attributes; its state is a dictionary, or a pair whose second one is for ``__slots__``."""
     parts = record.state if isinstance(record.state, tuple) else (record.state,)
     fields: dict[str, Any] = {}
     for part in parts:
@@ -246,7 +249,7 @@ def _plain_array(record: _Array) -> np.ndarray:
 
 
 def _from_bytes(data: Any, dtype: Any, shape: Any, *, fortran: bool) -> np.ndarray:
-    """An array of a plain type whose bytes are exactly as many as its shape needs."""
+    """Build an array of a plain type from exactly the bytes that its shape needs."""
     plain = _plain_dtype(dtype)
     if not isinstance(shape, tuple) or not all(isinstance(size, int) and size >= 0 for size in shape):
         raise ValueError("an array without a shape")
@@ -267,7 +270,7 @@ def _raw_bytes(data: Any) -> bytes:
 
 
 def _plain_dtype(record: Any) -> np.dtype:
-    """A number type: no objects, fields, sub-arrays or strings."""
+    """Return the number type of a record; refuse objects, fields, sub-arrays and strings."""
     if not isinstance(record, _Dtype) or not record.args:
         raise ValueError("an array without a type")
     code, state = record.args[0], record.state
@@ -283,7 +286,7 @@ def _plain_dtype(record: Any) -> np.dtype:
 
 
 def _dense(fields: dict[str, Any], *, depth: int) -> np.ndarray:
-    """A compressed sparse column matrix, written out."""
+    """Build the dense form of a compressed sparse column matrix."""
     shape = fields["_shape"] if "_shape" in fields else fields["shape"]
     if not (isinstance(shape, tuple) and len(shape) == 2):
         raise ValueError("a sparse matrix without a shape")
@@ -301,12 +304,14 @@ def _dense(fields: dict[str, Any], *, depth: int) -> np.ndarray:
     if count > len(data) or np.any(indices[:count] < 0) or np.any(indices[:count] >= rows):
         raise ValueError("a sparse matrix with indices out of range")
     dense = np.zeros((rows, columns), data.dtype)
-    np.add.at(dense, (indices[:count], np.repeat(np.arange(columns), np.diff(starts))), data[:count])
+    # Column j has the entries starts[j] to starts[j + 1]. Entries with the same indices add up, as scipy's do.
+    column_of_entry = np.repeat(np.arange(columns), np.diff(starts))
+    np.add.at(dense, (indices[:count], column_of_entry), data[:count])
     return dense
 
 
 def _selected(fields: dict[str, Any], *, depth: int) -> np.ndarray:
-    """Elements of an array by their flat indices, in the shape that chumpy prefers for them."""
+    """Return elements of an array by their flat indices, in the shape that chumpy records for them."""
     flat = _array(fields["a"], depth=depth + 1).reshape(-1)
     indices = _array(fields["idxs"], depth=depth + 1).reshape(-1)
     if indices.dtype.kind not in "iu" or np.any(indices < 0) or np.any(indices >= flat.size):

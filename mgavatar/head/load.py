@@ -1,4 +1,4 @@
-"""Head models from files: ``.npz`` with FLAME's keys, and FLAME's own pickles."""
+"""Head models in files: ``.npz`` with FLAME's keys, and FLAME's own pickles."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def load_head_model(path: Path) -> HeadModel:
 
 
 def head_arrays(model: HeadModel) -> dict[str, np.ndarray]:
-    """A head model as the arrays of its ``.npz`` file."""
+    """Return the arrays of a head model's ``.npz`` file by their keys."""
     arrays = {
         "v_template": model.v_template,
         "f": model.faces,
@@ -68,13 +68,17 @@ def head_arrays(model: HeadModel) -> dict[str, np.ndarray]:
 
 
 def save_head_model(path: Path, model: HeadModel) -> None:
-    """Write a head model as the ``.npz`` that ``load_head_model`` reads."""
+    """Write a head model as the ``.npz`` file that :func:`load_head_model` reads.
+
+    Raises:
+        DataError: If the file cannot be written.
+    """
     with atomic_write(path) as file:
         np.savez_compressed(file, allow_pickle=False, **head_arrays(model))
 
 
 def _basis_of_names(*names: str) -> str:
-    """The expression basis that the first telling name names: a file's, then its folder's."""
+    """Guess the expression basis from the names of a file and of its folder; the first that tells it counts."""
     for name in (name.lower().replace("-", "_") for name in names):
         if "flame" in name and "2023" in name:
             variants = {"no_jaw": "flame2023_no_jaw", "nojaw": "flame2023_no_jaw", "open": "flame2023_open"}
@@ -91,10 +95,14 @@ def _from_npz(path: Path) -> HeadModel:
 
 
 def head_from_arrays(arrays: dict[str, np.ndarray], *, path: Path) -> HeadModel:
-    """A head model from the arrays of its ``.npz`` file, checked; ``path`` is for messages.
+    """Build a head model from the arrays of its ``.npz`` file and check it.
+
+    Args:
+        arrays: Arrays by their keys, as :func:`head_arrays` returns them.
+        path: File that the messages name.
 
     Raises:
-        DataError: If something is missing, misshapen, not finite or out of range.
+        DataError: If an array is missing, has another shape, is not finite or is out of range.
     """
     if not any(key in arrays for key in RIG_KEYS):
         raise DataError(f"{path}: not a head model: it has none of {', '.join(RIG_KEYS)}")
@@ -152,7 +160,7 @@ def _checked(
     expr_basis: str,
     expr_names: tuple[str, ...],
 ) -> HeadModel:
-    """Check every array against the others and convert it to the type that ``HeadModel`` states."""
+    """Check the arrays against each other and convert them to the types of ``HeadModel``."""
     n_joints = len(JOINTS)
     v_template = _floats(arrays, "v_template", (None, 3), path=path)
     _check_metres(v_template, path=path)
@@ -202,7 +210,7 @@ def _check_metres(v_template: np.ndarray, *, path: Path) -> None:
 
 
 def _indices(value: np.ndarray, count: int, *, where: str, of: str) -> np.ndarray:
-    """Triangles, [F, 3] int32, whose indices are below ``count``."""
+    """Return triangles as int32, shape [F, 3], whose indices are below ``count``."""
     if value.ndim != 2 or value.shape[1] != 3 or value.dtype.kind not in "iu":
         raise DataError(f"{where} has shape {value.shape} and type {value.dtype}, (F, 3) integers are needed")
     if not len(value):
@@ -244,7 +252,7 @@ def _skinning_weights(arrays: dict[str, np.ndarray], n_verts: int, *, path: Path
 
 
 def _parents(table: np.ndarray, *, where: str) -> np.ndarray:
-    """Parent of each joint from FLAME's table, whose root has the parent 2**32 - 1 or -1."""
+    """Return the parent of each joint from FLAME's table, in which that of the root is 2**32 - 1 or -1."""
     n_joints = len(JOINTS)
     if table.shape != (2, n_joints) or table.dtype.kind not in "iu":
         raise DataError(f"{where} has shape {table.shape} and type {table.dtype}, (2, {n_joints}) integers are needed")
@@ -264,7 +272,7 @@ def _count(value: np.ndarray, *, where: str) -> int:
 
 def _text(value: np.ndarray, *, path: Path) -> str:
     if value.size != 1 or value.dtype.kind != "U":
-        raise DataError(f"{path}: expr_basis must be one word, such as flame2023")
+        raise DataError(f"{path}: expr_basis must be one word, for example flame2023")
     return one_line(value.item(), limit=60)
 
 
@@ -285,7 +293,7 @@ def _vertex_mask(value: np.ndarray, n_verts: int, *, where: str) -> np.ndarray:
 
 
 def _uvs_beside(path: Path, faces: np.ndarray) -> tuple[Path, dict[str, np.ndarray]]:
-    """Texture coordinates for a FLAME pickle, from the first file in its folder that has them."""
+    """Read the texture coordinates for a FLAME pickle from the first file in its folder that has them."""
     for name in UV_FILES:
         beside = path.with_name(name)
         if beside.exists():
@@ -303,9 +311,9 @@ def _uvs_beside(path: Path, faces: np.ndarray) -> tuple[Path, dict[str, np.ndarr
 
 
 def _obj_uvs(path: Path, faces: np.ndarray) -> dict[str, np.ndarray]:
-    """Texture coordinates of an OBJ whose triangles are those of ``faces``, in that order.
+    """Read the texture coordinates of an OBJ whose triangles are those of ``faces``, in the same order.
 
-    Its positions are not looked at: those of FLAME's template mesh are displaced.
+    Its positions are not compared with the head's: FLAME's template mesh is displaced.
     """
     coordinates, corners = [], []
     try:
@@ -314,9 +322,10 @@ def _obj_uvs(path: Path, faces: np.ndarray) -> dict[str, np.ndarray]:
             if words[:1] == ["vt"]:
                 coordinates.append((float(words[1]), float(words[2])))
             elif words[:1] == ["f"]:
+                # "vertex/texture" or "vertex/texture/normal"; a polygon with another number of corners fails here
                 (a, at, *_), (b, bt, *_), (c, ct, *_) = (word.split("/") for word in words[1:])
                 corners.append(((int(a), int(b), int(c)), (int(at), int(bt), int(ct))))
-        both = np.array(corners, np.int64).reshape(-1, 2, 3) - 1
+        both = np.array(corners, np.int64).reshape(-1, 2, 3) - 1  # an OBJ counts from 1
     except (ValueError, IndexError, OverflowError) as error:
         raise DataError(f"{path}: not an OBJ of triangles with texture coordinates ({one_line(error)})") from error
     if not np.array_equal(both[:, 0], np.asarray(faces)):
@@ -325,7 +334,7 @@ def _obj_uvs(path: Path, faces: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _masks_beside(path: Path, n_verts: int) -> dict[str, np.ndarray]:
-    """Regions of a FLAME head: ``FLAME_masks.pkl``, plus ``eyeballs``, the union of both."""
+    """Read the regions of a FLAME head from ``FLAME_masks.pkl``; add ``eyeballs``, the union of both."""
     beside = path.with_name(MASK_FILE)
     if not beside.exists():
         return {}

@@ -1,4 +1,4 @@
-"""The head model in FLAME's schema, whatever its topology and numbers of directions."""
+"""The head model in FLAME's schema, of any topology and with any number of directions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
 
 @dataclass(frozen=True, eq=False)
 class HeadModel:
-    """A rigged head; metres, x to the subject's left, y up, z forward.
+    """A rigged head in metres: x to the subject's left, y up, z forward.
 
     Attributes:
         v_template: Rest vertices [m], shape [V, 3], float32.
@@ -26,10 +26,10 @@ class HeadModel:
         vt: Texture coordinates, v up, shape [U, 2], float32.
         ft: Texture indices of each face, shape [F, 3], int32.
         masks: Named vertex regions (``face``, ``scalp``, ``neck``, ``boundary``, ...), each shape [V], bool.
-        expr_basis: What the expression directions mean: ``"flame2020"``, ``"flame2023"``, ``"procedural"``, a name
-            that the file gives, or ``"unknown"``.
+        expr_basis: Name of the space of expressions: ``"flame2020"``, ``"flame2023"``, ``"procedural"``, a name from
+            the file, or ``"unknown"``.
         expr_names: Names of the expression directions, or an empty tuple.
-        name: Where the model comes from, for messages and provenance.
+        name: Name of the model's file, for messages and provenance.
     """
 
     v_template: np.ndarray

@@ -1,4 +1,4 @@
-"""FLAME's parameters: of T frames as arrays, of one frame as tensors."""
+"""FLAME's parameters: as arrays over T frames, and as tensors for one frame."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 POSE_WIDTHS = {"rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6, "translation": 3}
-"""Number of columns of each parameter that every FLAME head has."""
+"""Number of columns of each parameter whose width is the same in all FLAME heads."""
 
 MOTION_KEYS = ("expr", *POSE_WIDTHS)
 """Parameters that change from frame to frame."""
@@ -26,7 +26,7 @@ class HeadParams:
         jaw_pose: Shape [T, 3].
         eyes_pose: Left, then right eye, shape [T, 6].
         translation: Added after skinning [m], shape [T, 3].
-        shape: Identity coefficients of all frames, shape [S]; empty where the motion says nothing about identity.
+        shape: Identity coefficients of all frames, shape [S]; empty if the motion has no identity.
         static_offset: Vertex offsets of the tracker [m], shape [V, 3], or None.
     """
 
@@ -54,7 +54,7 @@ class HeadParams:
             raise ValueError(f"expr {self.expr.shape} and shape {self.shape.shape} need shapes (T, E) and (S,)")
         if self.static_offset is not None and self.static_offset.shape[1:] != (3,):
             raise ValueError(f"static_offset has shape {self.static_offset.shape}, (V, 3) is needed")
-        for entry in fields(HeadParams):  # a subclass may have fields that are no numbers
+        for entry in fields(HeadParams):  # a subclass may have fields that are not numbers
             values = getattr(self, entry.name)
             if values is not None and not np.isfinite(values).all():
                 raise ValueError(f"{entry.name} holds NaN or infinity")
@@ -73,7 +73,7 @@ class HeadParams:
 
         Args:
             frame: Row of the arrays.
-            n_expr: Number of expression coefficients of the head, to which the row is padded or truncated; all if None.
+            n_expr: Length to which ``expr`` is padded or truncated, that of the head model; None keeps all of it.
         """
         rows = {name: getattr(self, name)[frame] for name in MOTION_KEYS}
         if n_expr is not None:
@@ -106,7 +106,7 @@ class Pose:
         return torch.cat([self.rotation, self.neck_pose, self.jaw_pose, self.eyes_pose]).reshape(5, 3)
 
     def without_root(self) -> Pose:
-        """Return the same face without root rotation and translation."""
+        """Return the same expression, neck, jaw and eyes without root rotation and translation."""
         zero = torch.zeros_like(self.rotation)
         return Pose(self.expr, zero, self.neck_pose, self.jaw_pose, self.eyes_pose, zero)
 

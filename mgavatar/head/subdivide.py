@@ -1,4 +1,4 @@
-"""One midpoint subdivision of the template (Section 3.1: 5K vertices and 10K faces become 20K and 40K)."""
+"""Midpoint subdivision of a head model (Section 3.1: 5K vertices and 10K faces become 20K and 40K)."""
 
 from __future__ import annotations
 
