@@ -16,7 +16,7 @@ from mgavatar import __version__
 from mgavatar.appearance.model import Appearance, build_appearance
 from mgavatar.camera import Camera
 from mgavatar.capture.info import CaptureInfo
-from mgavatar.config import FitConfig, check, from_dict, settled
+from mgavatar.config import ResolvedConfig, from_dict
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file, one_line
 from mgavatar.geometry.head import PersonalHead
@@ -45,7 +45,7 @@ class AvatarParts:
     vertex_gaussians: VertexGaussians
     appearance: Appearance | None
     capture: CaptureInfo
-    config: FitConfig
+    config: ResolvedConfig
 
     @property
     def n_gaussians(self) -> int:
@@ -84,12 +84,12 @@ def read_avatar(path: Path, *, device: torch.device | str = "cpu") -> AvatarPart
     existing_file(path)
     payload = _read(path)
     try:
-        config = _config(payload["config"])
+        config = from_dict(payload["config"], ResolvedConfig)
         arrays = {
             name: value.numpy() if isinstance(value, Tensor) else np.array(value)
             for name, value in payload["head"].items()
         }
-        subdivisions = settled(config.geometry.subdivisions)
+        subdivisions = config.geometry.subdivisions
         body = Body(head_from_arrays(arrays, path=path), subdivisions=subdivisions, device=device)
         capture = _capture_of(payload["capture"])
         head = PersonalHead(body, capture.tracked, config.geometry)
@@ -143,7 +143,7 @@ _UPGRADES = {"mgavatar/2": _from_format_2}
 """From each past format to the next one."""
 
 
-def _appearance(head: PersonalHead, config: FitConfig, state: dict[str, Tensor], n: int) -> Appearance:
+def _appearance(head: PersonalHead, config: ResolvedConfig, state: dict[str, Tensor], n: int) -> Appearance:
     appearance = build_appearance(head, config, seed=0)
     face_ids = state["gaussians.face_ids"]
     n_faces = len(head.body.faces)
@@ -215,15 +215,6 @@ def _capture_of(state: dict[str, Any]) -> CaptureInfo:
     if len(ids) != len(tracked["expr"]) or not all(0 <= timestep < len(ids) for timestep in train):
         raise ValueError("timesteps do not fit the tracked parameters")
     return CaptureInfo(HeadParams(**tracked), ids, train, cameras, background)
-
-
-def _config(table: dict[str, Any]) -> FitConfig:
-    config = from_dict(table)
-    try:
-        check(config)
-    except DataError as error:
-        raise ValueError(str(error)) from error
-    return config
 
 
 def _brief(error: Exception) -> str:

@@ -1,4 +1,4 @@
-"""The command line: typed functions, one line for what the user can mend.
+"""The command line: typed functions, and one line for everything that the user can mend.
 
 Exit codes: 0 done, 1 the data is wrong, 2 the command line is wrong, 130 interrupted. Heavy imports happen inside the
 commands, so that ``--help`` is quick.
@@ -6,77 +6,54 @@ commands, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import dataclasses
+import inspect
 import json
 import logging
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
+from mgavatar import __version__
 from mgavatar import config as configs
-from mgavatar.config import FitConfig
+from mgavatar.config import Background, FitConfig, PrincipalPoint
 from mgavatar.errors import DataError
+from mgavatar.presets import preset, preset_names, preset_summary
 
 if TYPE_CHECKING:
-    import torch
-
     from mgavatar.capture.subject import Subject
 
-Device = Literal["auto", "cpu", "cuda"]
+DEFAULT_PRESET = "quick"
 
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def _device(name: Device) -> torch.device:
-    import torch
-
-    if name == "cuda" and not torch.cuda.is_available():
-        raise DataError("--device cuda: this machine has no CUDA device that torch can use; give --device cpu")
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and torch.cuda.is_available()) else "cpu")
-
-
-def _check_seed(seed: int) -> None:
-    if not 0 <= seed < 2**31:
-        raise DataError(f"--seed {seed}: must lie between 0 and {2**31 - 1}")
-
-
-def _checked_capture(data: Path, principal_point: Literal["center", "opencv", "opengl"]) -> Subject:
-    """Read a capture and decode every image once: what is wrong with it is said before any work."""
-    from mgavatar.capture.images import check_images
-    from mgavatar.capture.read import read_capture
-
-    subject = read_capture(data, principal_point=principal_point)
-    check_images(subject)
-    return subject
+# The configuration's keys are flags of their own: --geometry.iterations, not --config.geometry.iterations.
+Config = Annotated[FitConfig, tyro.conf.arg(name="")]
 
 
 def demo(
     *,
     out: Path = Path("demo_out"),
-    device: Device = "auto",
+    device: str = "auto",
     seed: int = 0,
-    preset: str = "quick",
-    config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008  frozen
+    preset: str = DEFAULT_PRESET,
+    config: Config = FitConfig(),  # noqa: B008  frozen
 ) -> None:
     """Make a synthetic capture, fit an avatar to it, drive it, score it and write a report.
 
     Args:
         out: New folder for everything.
-        device: Where to compute.
-        seed: Of the person and of the fit.
+        device: auto, cpu, cuda or cuda:N.
+        seed: Seed of the person and of the fit.
         preset: As in fit.
         config: As in fit.
     """
     from mgavatar.demo import run_demo
 
-    _check_seed(seed)
-    configs.check(config)
-    _say_notes(_score_lines(run_demo(out, config, device=_device(device), seed=seed)))
+    scores = run_demo(out, config, device=device, seed=seed)
+    _say_all(_score_lines(scores))
     print(out / "run" / "report.html")
 
 
@@ -88,7 +65,7 @@ def synth(
     size: str = "256x256",
     seed: int = 0,
     monocular: bool = False,
-    head_model: Path | None = None,
+    head_model: str = "builtin",
 ) -> None:
     """Ray-trace a synthetic capture with its ground truth.
 
@@ -97,179 +74,150 @@ def synth(
         cameras: Number of cameras.
         timesteps: Number of timesteps.
         size: Image size, WIDTHxHEIGHT.
-        seed: Of the person and of the motion.
+        seed: Seed of the person and of the motion.
         monocular: One camera and a turning head, with two cameras at its sides to score novel views only.
-        head_model: Head model to start from, the built-in one by default.
+        head_model: Head model to start from: a FLAME .pkl, a head .npz, or builtin.
     """
+    from mgavatar.head.find import load_head_model
+    from mgavatar.pipeline import check_seed
     from mgavatar.progress import Reporter
     from mgavatar.synthetic.capture import make_synthetic_capture
 
-    _check_seed(seed)
-
+    check_seed(seed)
+    pixels = _size(size)
+    head = load_head_model(head_model)
     with Reporter("synth", timesteps * (1 if monocular else cameras)) as reporter:
         make_synthetic_capture(
             out,
             cameras=cameras,
             timesteps=timesteps,
-            size=_size(size),
+            size=pixels,
             seed=seed,
             monocular=monocular,
-            head=_head(head_model) if head_model else None,
+            head=head,
             progress=lambda done, total: reporter.update(done, total=total),
         )
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and 16 <= int(width) <= 8192 and 16 <= int(height) <= 8192):
-        raise DataError(f"--size {text}: give WIDTHxHEIGHT between 16 and 8192, for example 256x256")
-    return int(width), int(height)
-
-
-def _head(path: Path | None) -> Any:
-    if path is None:
-        from mgavatar.head.procedural.build import build_head
-
-        return build_head()
-    from mgavatar.head.load import load_head_model
-
-    return load_head_model(path)
 
 
 def fit(
     *,
     data: Path,
-    out: Path,
-    head_model: Path | None = None,
-    preset: str = "quick",
-    device: Device = "auto",
+    out: Path = Path("out.pt"),
+    head_model: str | None = None,
+    preset: str = DEFAULT_PRESET,
+    device: str = "auto",
     seed: int = 0,
     resume: bool = False,
     budget: str | None = None,
-    config: Annotated[FitConfig, tyro.conf.arg(name="")] = FitConfig(),  # noqa: B008  frozen
+    config: Config = FitConfig(),  # noqa: B008  frozen
 ) -> None:
     """Fit an avatar to a tracked capture.
 
     Args:
-        data: Capture in the layout of VHAP and GaussianAvatars, a folder with transforms_train.json.
-        out: New folder for the avatar, its report and checkpoints; or the path of the avatar, ending in .pt.
-        head_model: FLAME-schema .npz or FLAME .pkl that the capture was tracked with; the built-in head by default.
-        preset: Name of a preset, or a .toml file; flags after it win.
-        device: Where to compute.
-        seed: Repeats a run bit for bit on one machine.
-        resume: Go on with the fit in --out.
-        budget: Time after which the avatar is written, counted from now, for example 90s, 5m or 1h; iterations, rates
-            and density control are scaled to it. The score of a sample and the report come after.
-        config: Every other number.
+        data: Folder of the capture, in the layout of VHAP and GaussianAvatars.
+        out: The avatar, ending in .pt, with its report in the folder of that name; or a folder for everything.
+        head_model: FLAME .pkl or head .npz that the capture was tracked with, or builtin; by default as it names.
+        preset: Preset or .toml file; several are combined with commas, later ones override earlier ones.
+        device: auto, cpu, cuda or cuda:N.
+        seed: Seed of all random draws; a fit repeats bit for bit on one machine.
+        resume: Continue the fit in --out.
+        budget: Time after which the avatar is written, such as 90s, 5m or 1h, counted from now.
+        config: Every number of the method.
     """
+    # The clock starts before the heavy imports.
     from mgavatar.fitting.budget import Budget, parse_budget
 
     limit = Budget(parse_budget(budget)) if budget is not None else None
-    from mgavatar.fitting.fit import fit as run_fit
-    from mgavatar.fitting.loop import Interrupted
+    from mgavatar.capture.read import read_capture
     from mgavatar.fitting.run import open_run
+    from mgavatar.head.find import resolve_head_model
+    from mgavatar.pipeline import check_seed
+    from mgavatar.pipeline import fit as run_fit
+    from mgavatar.progress import FitReporter
 
-    _check_seed(seed)
+    check_seed(seed)
     configs.check(config)
-    run = open_run(out, resume=resume)
-    chosen = _device(device)
-    head = _head(head_model)
-    subject = _checked_capture(data, config.principal_point)
-    _say_notes(_capture_notes(subject, head))
-    try:
-        avatar = run_fit(subject, head, config, run, device=chosen, seed=seed, resume=resume, budget=limit)
-    except Interrupted as stop:
-        _say(f"mgavatar: {stop}; {run.avatar} is usable, `--resume` goes on")
-        raise SystemExit(130) from None
-    from mgavatar.reporting.page import write_report
-    from mgavatar.scoring.evaluate import evaluate_sample
-
-    metrics = evaluate_sample(avatar, subject, avatar_path=run.avatar)
-    report = write_report(run.folder, avatar, subject, metrics, history=run.metrics)
-    _say_notes(_score_lines(metrics))
-    print(run.avatar)
-    print(report)
-
-
-def _capture_notes(subject: Any, head: Any) -> list[str]:
-    """What of the capture's parameters the head model cannot take."""
-    import numpy as np
-
-    notes = []
-    for name, values, n in (("shape", subject.params.shape, head.n_shape), ("expr", subject.params.expr, head.n_expr)):
-        if np.any(values[..., n:]):
-            notes.append(
-                f"{subject.root}: {name} has {values.shape[-1]} columns, {head.name} takes {n}: the rest is cut"
-            )
-    return notes
-
-
-def _say_notes(notes: list[str]) -> None:
-    for note in notes:
-        _say(f"mgavatar: {note}")
-
-
-def _score_lines(metrics: dict[str, Any]) -> list[str]:
-    lines = []
-    for split, score in metrics["splits"].items():
-        naive = max(score["naive"].values()) if score.get("naive") else None
-        beside = f" (best naive baseline {naive:.2f})" if naive is not None else ""
-        lines.append(f"{split} ({score['task']}): PSNR {score['psnr']:.2f} dB{beside}, SSIM {score['ssim']:.4f}")
-    if metrics["geometry"]:
-        lines.append(f"geometry: mean {metrics['geometry']['mean_mm']:.2f} mm from the ground truth")
-    return lines
+    open_run(out, resume=resume)  # what is wrong with --out is said before the capture is read
+    subject = read_capture(data, background=config.background, principal_point=config.principal_point)
+    head = resolve_head_model(head_model, data)
+    with FitReporter() as reporter:
+        result = run_fit(
+            subject, head, config, out=out, device=device, seed=seed, resume=resume, budget=limit, progress=reporter
+        )
+    if not result.finished:
+        _say(f"{result.stopped_at}; {result.path} is usable, `--resume` continues the fit")
+        raise SystemExit(130)
+    if result.scores is not None:
+        _say_all(_score_lines(result.scores))
+    print(result.path)
+    if result.report is not None:
+        print(result.report)
 
 
 def render(
     *,
     avatar: Path,
     driving: Path,
-    out: Path,
+    out: Path | None = None,
     camera: str = "mean",
     head_motion: Literal["full", "neck", "none"] = "full",
     expression: Literal["auto", "use", "ignore"] = "auto",
     format: Literal["auto", "png", "exr", "mp4"] = "auto",
     size: str | None = None,
-    device: Device = "auto",
+    frames: str | None = None,
+    fps: float | None = None,
+    overwrite: bool = False,
+    device: str = "auto",
 ) -> None:
     """Drive an avatar with a sequence of FLAME parameters.
 
     Args:
-        avatar: avatar.pt, or the folder of its fit.
-        driving: .npz with VHAP's keys, or a folder of one .npz a frame; missing keys are zero.
-        out: FILE.mp4, FILE.gif, or a folder for single frames.
+        avatar: The avatar, or the folder of its fit.
+        driving: Motion: .npz with VHAP's keys, or a folder with one .npz per frame; missing keys are zero.
+        out: FILE.mp4, FILE.gif, or a folder for single frames; by default a video named after the motion.
         camera: mean, train:ID, orbit, or a .json with the keys of a transforms frame.
-        head_motion: The root's motion as driven (full), put into the neck (neck), or none.
-        expression: Whether the driving file's expression fits this head: decide by its basis, use it or ignore it.
-        format: Of single frames, or mp4; by default what --out says.
-        size: Image size, WIDTHxHEIGHT, the camera's own by default.
-        device: Where to compute.
+        head_motion: Take the root's motion as driven (full), put it into the neck (neck), or take none.
+        expression: Use the expression columns if their basis is the head's (auto), always (use), or ignore them.
+        format: Format of single frames, or mp4; by default as --out says.
+        size: Image size, WIDTHxHEIGHT; the camera's own by default.
+        frames: Frames to draw, START:STOP or START:STOP:STEP, counted from 0.
+        fps: Frames per second of the video; by default as the motion says, else 25.
+        overwrite: Replace a video that is there already.
+        device: auto, cpu, cuda or cuda:N.
     """
     from mgavatar.avatar import Avatar
+    from mgavatar.device import find_device
     from mgavatar.driving.motion import read_driving
-    from mgavatar.driving.render import render_driving
+    from mgavatar.driving.render import render as run_render
+    from mgavatar.driving.writers import default_name, kind_of
     from mgavatar.progress import Reporter
 
+    pixels = _size(size) if size else None
+    chosen = _slice(frames) if frames else None
+    target = out if out is not None else default_name(driving, format)
+    kind_of(target, format, overwrite=overwrite)
     motion = read_driving(driving)
-    loaded = Avatar.load(_avatar_path(avatar), device=_device(device))
-    with Reporter("render", len(motion.expr)) as reporter:
-        notes = render_driving(
+    if fps is not None:
+        if not 0.0 < fps <= 1000.0:
+            raise DataError(f"--fps {fps:g}: must lie between 0 and 1000")
+        motion = dataclasses.replace(motion, fps=fps)
+    loaded = Avatar.load(avatar, device=find_device(device))
+    with Reporter("render", len(motion)) as reporter:
+        notes = run_render(
             loaded,
             motion,
-            out=out,
+            out=target,
             camera=camera,
             head_motion=head_motion,
             expression=expression,
             format=format,
-            size=_size(size) if size else None,
-            progress=lambda done, total: reporter.update(done),
+            size=pixels,
+            frames=chosen,
+            overwrite=overwrite,
+            progress=lambda done, total: reporter.update(done, total=total),
         )
-    _say_notes(notes)
-    print(out)
-
-
-def _avatar_path(path: Path) -> Path:
-    return path / "avatar.pt" if path.is_dir() else path
+    _say_all(notes)
+    print(target)
 
 
 def evaluate(
@@ -279,54 +227,53 @@ def evaluate(
     split: Literal["val", "test", "all"] = "all",
     json: Path | None = None,
     lpips_weights: Path | None = None,
-    principal_point: Literal["center", "opencv", "opengl"] | None = None,
-    device: Device = "auto",
+    background: Background | None = None,
+    principal_point: PrincipalPoint | None = None,
+    device: str = "auto",
 ) -> None:
     """Score an avatar on the held-out frames of a capture, at full size.
 
     Args:
-        avatar: avatar.pt, or the folder of its fit.
-        data: The capture.
-        split: Novel view (val), self-reenactment (test), or all.
-        json: Also write the scores here.
+        avatar: The avatar, or the folder of its fit.
+        data: Folder of the capture.
+        split: Novel views (val), self-reenactment (test), or all.
+        json: Write the scores to this file instead of printing them.
         lpips_weights: State dict of LPIPS-VGG; nothing is ever downloaded.
-        principal_point: As in fit, the avatar's own by default.
-        device: Where to compute.
+        background: As in fit; the avatar's own by default.
+        principal_point: As in fit; the avatar's own by default.
+        device: auto, cpu, cuda or cuda:N.
     """
     from mgavatar.avatar import Avatar
+    from mgavatar.device import find_device
     from mgavatar.progress import Reporter
     from mgavatar.scoring.evaluate import evaluate as run_evaluate
     from mgavatar.scoring.evaluate import write_metrics
 
-    path = _avatar_path(avatar)
-    loaded = Avatar.load(path, device=_device(device))
-    subject = _checked_capture(data, principal_point or loaded.config.principal_point)
+    loaded = Avatar.load(avatar, device=find_device(device))
+    own = loaded.config
+    subject = _checked_capture(data, background or own.background, principal_point or own.principal_point)
     splits: tuple[Literal["val", "test"], ...] = ("val", "test") if split == "all" else (split,)
     with Reporter("evaluate", sum(len(subject.frames[name]) for name in splits)) as reporter:
         metrics = run_evaluate(
             loaded,
             subject,
-            avatar_path=path,
+            avatar_path=avatar,
             splits=splits,
             lpips_weights=lpips_weights,
-            progress=lambda done, total: reporter.update(done),
+            progress=lambda done, total: reporter.update(done, total=total),
         )
-    _say_notes(_score_lines(metrics))
+    _say_all(_score_lines(metrics))
     if json is not None:
         write_metrics(json, metrics)
     else:
         print(_as_json(metrics))
 
 
-def _as_json(metrics: dict[str, Any]) -> str:
-    return json.dumps(metrics, indent=2)
-
-
 def bench_kernels(
     *,
     threads: int | None = None,
     json: Path | None = None,
-    device: Device = "cpu",
+    device: str = "cpu",
     avatar: Path | None = None,
 ) -> None:
     """Time every kernel against its plain form and against this machine's lower bound.
@@ -334,13 +281,14 @@ def bench_kernels(
     Args:
         threads: CPU threads of the kernels, all cores by default.
         json: Also write the rows to this file.
-        device: Where to compute.
-        avatar: avatar.pt, or the folder of its fit, to time beside the synthetic scenes.
+        device: auto, cpu, cuda or cuda:N.
+        avatar: An avatar, or the folder of its fit, to time beside the synthetic scenes.
     """
     from mgavatar.benchmarks.kernels import bench_kernels as run_benchmark
+    from mgavatar.device import find_device
 
-    chosen = _avatar_path(avatar) if avatar else None
-    print(run_benchmark(threads=threads, json_path=json, device=_device(device).type, avatar=chosen))
+    chosen = avatar / "avatar.pt" if avatar is not None and avatar.is_dir() else avatar
+    print(run_benchmark(threads=threads, json_path=json, device=find_device(device).type, avatar=chosen))
 
 
 # Each benchmark is a sub-command with flags of its own. tyro runs it while it builds the argument of `bench`.
@@ -361,6 +309,58 @@ _COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+def _checked_capture(data: Path, background: Background, principal_point: PrincipalPoint) -> Subject:
+    """Read a capture and decode every image once, so that a bad file is found before any work."""
+    from mgavatar.capture.images import check_images
+    from mgavatar.capture.read import read_capture
+
+    subject = read_capture(data, background=background, principal_point=principal_point)
+    check_images(subject)
+    return subject
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and 16 <= int(width) <= 8192 and 16 <= int(height) <= 8192):
+        raise DataError(f"--size {text}: give WIDTHxHEIGHT between 16 and 8192, for example 256x256")
+    return int(width), int(height)
+
+
+def _slice(text: str) -> slice:
+    """Return the slice that ``START:STOP`` or ``START:STOP:STEP`` means; each number may be left out."""
+    parts = text.split(":")
+    numbers = [int(part) if part.isdigit() else None for part in parts]
+    if len(parts) not in (2, 3) or any(part and not part.isdigit() for part in parts) or 0 in numbers[2:]:
+        raise DataError(f"--frames {text}: give START:STOP or START:STOP:STEP, for example 0:100 or 0:100:5")
+    return slice(*numbers)
+
+
+def _as_json(metrics: dict[str, Any]) -> str:
+    return json.dumps(metrics, indent=2)
+
+
+def _score_lines(metrics: dict[str, Any]) -> list[str]:
+    lines = []
+    for split, score in metrics["splits"].items():
+        naive = max(score["naive"].values()) if score.get("naive") else None
+        beside = f" (best naive baseline {naive:.2f})" if naive is not None else ""
+        lines.append(f"{split} ({score['task']}): PSNR {score['psnr']:.2f} dB{beside}, SSIM {score['ssim']:.4f}")
+    if metrics["geometry"]:
+        lines.append(f"geometry: mean {metrics['geometry']['mean_mm']:.2f} mm from the ground truth")
+    return lines
+
+
+def _say(text: str) -> None:
+    print(f"mgavatar: {text}", file=sys.stderr, flush=True)
+
+
+def _say_all(lines: Sequence[str]) -> None:
+    for line in lines:
+        _say(line)
+
+
+# ---- parsing ----
+
 _FLAGS = tyro.constructors.ConstructorRegistry()
 
 
@@ -368,7 +368,7 @@ _FLAGS = tyro.constructors.ConstructorRegistry()
 def _switch_or_auto(
     info: tyro.constructors.PrimitiveTypeInfo,
 ) -> tyro.constructors.PrimitiveConstructorSpec[Any] | None:
-    """``--key true``, ``false`` or ``auto``: the words that a TOML file uses."""
+    """Parse ``--key true``, ``false`` or ``auto``: the words that a TOML file uses."""
     if info.type != bool | Literal["auto"]:
         return None
     words: dict[str, Any] = {"true": True, "false": False, "auto": "auto"}
@@ -382,36 +382,118 @@ def _switch_or_auto(
     )
 
 
-def _with_preset(argv: list[str]) -> list[str]:
-    """Put a preset's values before the user's flags: one parser checks both, and the user's win."""
-    if argv[:1] not in (["fit"], ["demo"]) or "--help" in argv or "-h" in argv:
-        return argv
-    preset = "quick"
+def _preset_of(argv: Sequence[str]) -> str:
+    """Return the value of the last ``--preset``."""
+    chosen = DEFAULT_PRESET
     for index, word in enumerate(argv):
         if word == "--preset" and index + 1 < len(argv):
-            preset = argv[index + 1]
+            chosen = argv[index + 1]
         elif word.startswith("--preset="):
-            preset = word.partition("=")[2]
-    return [argv[0], *configs.preset_flags(configs.read_preset(preset)), *argv[1:]]
+            chosen = word.partition("=")[2]
+    return chosen
 
 
-def main() -> None:
-    """Entry point of ``mgavatar``."""
-    # Threads that wait without spinning: on a busy machine spinning makes small parallel loops many times slower.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    os.environ.setdefault("GOMP_SPINCOUNT", "0")
-    logging.basicConfig(format="mgavatar: %(message)s")
-    logging.getLogger("mgavatar").setLevel(logging.INFO)
+def _with_default(command: Callable[..., None], config: FitConfig, *, short_help: bool) -> Callable[..., None]:
+    """Return a command whose configuration starts from a preset, so that the parser and its help show what will run.
+
+    Args:
+        command: A command with a parameter ``config``.
+        config: Default of that parameter.
+        short_help: Leave the sections of the configuration out of the help.
+    """
+
+    def run(**arguments: Any) -> None:
+        command(**arguments)
+
+    hints = get_type_hints(command, include_extras=True)
+    if short_help:
+        config = _without_sections(config)
+        hints["config"] = Annotated[type(config), tyro.conf.arg(name="")]
+    signature = inspect.signature(command)
+    parameters = [
+        parameter.replace(
+            annotation=hints[parameter.name], default=config if parameter.name == "config" else parameter.default
+        )
+        for parameter in signature.parameters.values()
+    ]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = hints
+    run.__name__ = command.__name__
+    run.__doc__ = command.__doc__
+    return run
+
+
+def _without_sections(config: FitConfig) -> FitConfig:
+    """Return the configuration as a type whose nested sections are hidden from the help."""
+    hints = get_type_hints(FitConfig, include_extras=True)
+    sections = [
+        (entry.name, Annotated[hints[entry.name], tyro.conf.Suppress], dataclasses.field())
+        for entry in dataclasses.fields(FitConfig)
+        if dataclasses.is_dataclass(hints[entry.name])
+    ]
+    kind = dataclasses.make_dataclass("FitConfig", sections, bases=(FitConfig,), frozen=True, kw_only=True)
+    kind.__doc__ = FitConfig.__doc__
+    return kind(**{entry.name: getattr(config, entry.name) for entry in dataclasses.fields(config)})
+
+
+def _presets_listed() -> str:
+    """Return the presets, one per line, for the end of a help text."""
+    names = [name for name in preset_names() if not name.startswith("no-")]
+    ablations = [name for name in preset_names() if name.startswith("no-")]
+    width = max(map(len, names)) + 2
+    lines = [f"  {name:{width}}{preset_summary(name)}" for name in names]
+    lines.append(f"  {'no-...':{width}}Ablations: {', '.join(ablations)}.")
+    return "\n".join(["presets:", *lines])
+
+
+def _run(argv: list[str]) -> None:
+    if argv == ["--version"]:
+        print(f"mgavatar {__version__}")
+        return
+    commands = dict(_COMMANDS)
+    takes_presets = argv[:1] in (["fit"], ["demo"])
+    wants_help = bool({"-h", "--help", "--help-all"} & set(argv))
+    if takes_presets:
+        short_help = wants_help and "--help-all" not in argv
+        commands[argv[0]] = _with_default(commands[argv[0]], preset(_preset_of(argv)), short_help=short_help)
+        argv = ["--help" if word == "--help-all" else word for word in argv]
     try:
         with _FLAGS:
             tyro.extras.subcommand_cli_from_dict(
-                _COMMANDS,
+                commands,
                 prog="mgavatar",
-                args=_with_preset(sys.argv[1:]),
+                args=argv,
                 description="Drivable Gaussian head avatars.",
+                config=(tyro.conf.DisallowNone,),
             )
+    except SystemExit as stop:
+        if takes_presets and wants_help and stop.code == 0:
+            print(_presets_listed())
+            print("Every number of the method is a flag too: --help-all lists them.")
+        raise
+
+
+def main() -> None:
+    """Run ``mgavatar`` with the arguments of the process."""
+    # Threads that wait without spinning: on a busy machine spinning makes small parallel loops many times slower.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("mgavatar: %(message)s"))
+    logger = logging.getLogger("mgavatar")
+    logger.setLevel(logging.INFO)
+    logger.addHandler(handler)
+    try:
+        _run(sys.argv[1:])
+        sys.stdout.flush()
     except DataError as error:
-        _say(f"mgavatar: {error}")
+        _say(str(error))
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+    except BrokenPipeError:
+        # Whoever read our output has left, as `head` does. Python flushes once more at exit: into nothing.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
+    finally:
+        logger.removeHandler(handler)

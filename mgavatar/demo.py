@@ -7,45 +7,45 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from mgavatar.avatar import Avatar
-from mgavatar.capture.images import check_images
 from mgavatar.capture.read import read_capture
-from mgavatar.capture.subject import Split, Subject
-from mgavatar.config import FitConfig
+from mgavatar.capture.subject import Subject
+from mgavatar.config import FitConfig, check
+from mgavatar.device import find_device
 from mgavatar.driving.motion import read_driving
-from mgavatar.driving.render import render_driving
+from mgavatar.driving.render import render
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
-from mgavatar.fitting.fit import fit
-from mgavatar.fitting.run import open_run
 from mgavatar.head.procedural.build import build_head
-from mgavatar.progress import Reporter
-from mgavatar.reporting.page import write_report
-from mgavatar.scoring.evaluate import evaluate, write_metrics
+from mgavatar.pipeline import check_seed, fit
+from mgavatar.progress import FitReporter, Reporter
+from mgavatar.scoring.evaluate import write_metrics
 from mgavatar.synthetic.capture import make_synthetic_capture
 
 DRIVING_FRAMES = 60
 FPS = 25.0
 
 
-def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -> dict[str, Any]:
-    """Make a capture, fit an avatar to it, drive it, score it and write a report, all in a new folder.
+def run_demo(out: Path, config: FitConfig, *, device: str, seed: int) -> dict[str, Any]:
+    """Make a capture, fit, drive, score and report in a new folder.
 
     Args:
         out: Folder to make; it gets ``capture``, ``run``, ``driving.npz``, ``driven.mp4`` (or ``.gif`` without PyAV)
             and ``metrics.json``.
         config: Configuration of the fit.
-        device: Device to fit and render on.
+        device: ``"auto"``, ``"cpu"``, ``"cuda"``, or a device of torch's.
         seed: Seed of the person and of the fit.
 
     Returns:
-        The scores, as :func:`mgavatar.scoring.evaluate.evaluate` returns them.
+        The scores, as :func:`mgavatar.evaluate` returns them.
 
     Raises:
-        DataError: If ``out`` exists and is not empty.
+        DataError: If ``out`` exists and is not empty, or the fit was stopped.
     """
+    check_seed(seed)
+    check(config)
+    find_device(device)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DataError(f"{out}: exists; give --out a new folder")
     out.mkdir(parents=True, exist_ok=True)
@@ -53,18 +53,24 @@ def run_demo(out: Path, config: FitConfig, *, device: torch.device, seed: int) -
     with Reporter("capture", 16 * 12) as reporter:
         make_synthetic_capture(out / "capture", seed=seed, head=head, progress=lambda done, _: reporter.update(done))
     subject = read_capture(out / "capture")
-    check_images(subject)
-    run = open_run(out / "run", resume=False)
-    avatar = fit(subject, head, config, run, device=device, seed=seed)
-    _drive(avatar, subject, out)
-    splits: tuple[Split, ...] = ("val", "test")
-    with Reporter("evaluate", sum(len(subject.frames[name]) for name in splits)) as reporter:
-        metrics = evaluate(
-            avatar, subject, avatar_path=run.avatar, splits=splits, progress=lambda done, _: reporter.update(done)
+    with FitReporter() as fit_reporter:
+        result = fit(
+            subject,
+            head,
+            config,
+            out=out / "run",
+            device=device,
+            seed=seed,
+            progress=fit_reporter,
+            score_images=None,
         )
-    write_metrics(out / "metrics.json", metrics)
-    write_report(run.folder, avatar, subject, metrics, history=run.metrics)
-    return metrics
+    if not result.finished:
+        raise KeyboardInterrupt
+    if result.scores is None:
+        raise DataError(f"{out}: the fit could not be scored")
+    write_metrics(out / "metrics.json", result.scores)
+    _drive(result.avatar, subject, out)
+    return result.scores
 
 
 def _drive(avatar: Avatar, subject: Subject, out: Path) -> None:
@@ -74,7 +80,7 @@ def _drive(avatar: Avatar, subject: Subject, out: Path) -> None:
         np.savez(file, **demo_motion(avatar))  # type: ignore[arg-type]
     with Reporter("render", DRIVING_FRAMES) as reporter:
         film = out / ("driven.mp4" if find_spec("av") else "driven.gif")
-        render_driving(avatar, read_driving(path), out=film, progress=lambda done, _: reporter.update(done))
+        render(avatar, read_driving(path), out=film, progress=lambda done, _: reporter.update(done))
 
 
 def demo_motion(avatar: Avatar) -> dict[str, np.ndarray]:

@@ -42,17 +42,23 @@ def draw(
     background: Tensor,
     config: RasterConfig,
     screen_grads: Tensor | None = None,
+    viewmat: Tensor | None = None,
 ) -> Rendering:
-    """Rasterize Gaussians from a camera; see :func:`mgavatar.kernels.rasterize.rasterize`."""
+    """Rasterize Gaussians from a camera; see :func:`mgavatar.kernels.rasterize.rasterize`.
+
+    ``viewmat`` takes the place of the camera's own, for example with a gradient.
+    """
     device = gaussians.means.device
     alpha_threshold, stop = config.thresholds()
+    if viewmat is None:
+        viewmat = torch.from_numpy(camera.viewmat.astype(np.float32)).to(device)
     return rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
         gaussians.opacities,
         gaussians.colors,
-        viewmat=torch.from_numpy(camera.viewmat.astype(np.float32)).to(device),
+        viewmat=viewmat,
         K=torch.from_numpy(camera.K.astype(np.float32)).to(device),
         size=(camera.width, camera.height),
         background=background,

@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -60,15 +63,64 @@ class Reporter:
             )
 
 
-class MetricsLog:
-    """Appends one JSON object a line, flushed, so that nothing is lost when the process is."""
+@dataclass(frozen=True)
+class FitProgress:
+    """The state of a fit after one iteration.
 
-    def __init__(self, path: Path) -> None:
-        self.file: IO[str] = path.open("a", encoding="utf-8")
+    Attributes:
+        stage: ``"geometry"`` or ``"appearance"``.
+        iteration: Iterations of this stage so far.
+        total: Iterations that this stage will have, an estimate if the fit has a budget.
+        terms: Weighted terms of the loss by their names, and the number of ``gaussians``.
+    """
+
+    stage: str
+    iteration: int
+    total: int
+    terms: Mapping[str, float]
+
+
+class FitReporter:
+    """Report the progress of a fit on stderr, one stage after the other."""
+
+    def __init__(self) -> None:
+        self._stage: str | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> FitReporter:
+        return self
+
+    def __call__(self, progress: FitProgress) -> None:
+        """Take the progress of an iteration."""
+        if progress.stage != self._stage:
+            self._stack.close()
+            self._stage = progress.stage
+            done = progress.iteration - 1
+            self._reporter = self._stack.enter_context(Reporter(progress.stage, progress.total, done=done))
+        terms = progress.terms
+        note = f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians"
+        self._reporter.update(progress.iteration, note, total=progress.total)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+
+class MetricsLog:
+    """Append one JSON object per line to a file, flushed, so that a killed process loses nothing."""
+
+    def __init__(self, path: Path | None) -> None:
+        """Open the file, or write nothing if ``path`` is None."""
+        self.file: IO[str] | None = path.open("a", encoding="utf-8") if path is not None else None
 
     def write(self, **values: object) -> None:
-        self.file.write(json.dumps(values) + "\n")
-        self.file.flush()
+        """Append one line."""
+        if self.file is not None:
+            self.file.write(json.dumps(values) + "\n")
+            self.file.flush()
 
     def close(self) -> None:
-        self.file.close()
+        """Close the file."""
+        if self.file is not None:
+            self.file.close()

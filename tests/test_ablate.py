@@ -23,9 +23,9 @@ from PIL import Image
 from tiny import tiny_config, tiny_head, write_tiny_capture
 from tiny_avatar import tiny_avatar
 
-from mgavatar.config import to_toml
 from mgavatar.errors import DataError
 from mgavatar.head.load import save_head_model
+from mgavatar.presets import to_toml
 
 REASON = "no weights given (--lpips-weights)"
 GEOMETRY = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import tiny_config, tiny_personal_head
+from tiny import tiny_personal_head, tiny_resolved
 
 from mgavatar.appearance.model import build_appearance
 from mgavatar.avatar import Avatar
@@ -34,7 +34,7 @@ def disturb(module: torch.nn.Module) -> None:
 
 def make_avatar(subject: Subject, *, n_gaussians: int | None) -> Avatar:
     """An avatar of which no part is at its start; without Gaussians on faces it is the geometry stage's."""
-    config = tiny_config()
+    config = tiny_resolved()
     head = tiny_personal_head(subject, config)
     vertex_gaussians = VertexGaussians(head, config)
     disturb(vertex_gaussians)
@@ -77,7 +77,7 @@ def assert_same_images(a: Avatar, b: Avatar, subject: Subject) -> None:
         for camera in cameras:
             one, other = a.render(pose, camera), b.render(pose, camera)
             assert one.alphas.max() > 0.5
-            for name in ("image", "alpha", "depth"):
+            for name in ("image", "alphas", "depths"):
                 assert torch.equal(getattr(one, name), getattr(other, name)), name
         assert torch.equal(a.verts(pose), b.verts(pose))
 
@@ -193,9 +193,9 @@ def assert_refused(path: Path) -> str:
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    """And a folder."""
+    """And a folder that is not that of a fit."""
     assert "no such file" in assert_refused(tmp_path / "absent.pt")
-    assert "folder" in assert_refused(tmp_path)
+    assert "avatar.pt: no such file" in assert_refused(tmp_path)
 
 
 class Evil:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import sph_harm_y
-from tiny import run, tiny_config, tiny_head, tiny_personal_head
+from tiny import run, tiny_config, tiny_head, tiny_personal_head, tiny_resolved
 
 from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.spherical_harmonics import sh_basis, sh_colors
@@ -20,12 +20,14 @@ from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar
 from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
-from mgavatar.config import FitConfig, HeadTuningConfig, OffsetNetConfig, ShConfig, from_dict, read_preset
+from mgavatar.config import FitConfig, HeadTuningConfig, OffsetNetConfig, ShConfig
 from mgavatar.errors import DataError
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.stage import GeometryStage
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
+from mgavatar.presets import preset as read_preset
+from mgavatar.presets import preset_table
 
 BASELINE = {
     "colors": "sh",
@@ -91,7 +93,7 @@ def test_spherical_harmonics_learn_and_go_through_density_control(subject, views
 
 def test_a_baseline_avatar_is_saved_and_goes_on_from_its_state(subject, views, tmp_path):
     """Both the file and the checkpoint hold the coefficients and the tuned parameters."""
-    config = tiny_config(appearance=BASELINE)
+    config = tiny_resolved(appearance=BASELINE)
     stage = make_stage(subject, config)
     run(stage, views, 9)
     other = make_stage(subject, config)
@@ -253,7 +255,7 @@ FIELD = {
 @pytest.mark.parametrize("preset", PARTS)
 def test_ablations_switch_their_part_and_nothing_else(preset, size):
     """Behind a preset of size, all other numbers are that preset's; baseline alone brings the field's rates."""
-    whole, part = flat(from_dict(read_preset(size))), flat(from_dict(read_preset(f"{size},{preset}")))
+    whole, part = flat(read_preset(size)), flat(read_preset(f"{size},{preset}"))
     changed = {key for key in whole if whole[key] != part[key]} - OF_A_PART_THAT_IS_OFF
     if preset == "baseline":
         changed -= {f"appearance.{key}" for key in FIELD}
@@ -263,15 +265,15 @@ def test_ablations_switch_their_part_and_nothing_else(preset, size):
 @pytest.mark.parametrize("size", ["quick", "balanced", "paper"])
 def test_the_baseline_has_the_field_s_rates_and_thresholds(size):
     """Whatever the preset of size says."""
-    values = flat(from_dict(read_preset(f"{size},baseline")))
+    values = flat(read_preset(f"{size},baseline"))
     assert {key: values[f"appearance.{key}"] for key in FIELD} == FIELD
 
 
 def test_presets_merge_from_left_to_right(tmp_path: Path):
     """The last one wins, key by key; an unknown one is named."""
     (tmp_path / "mine.toml").write_text("[appearance.density]\nstart = 7\n")
-    table = read_preset(f"quick,{tmp_path / 'mine.toml'}")
+    table = preset_table(f"quick,{tmp_path / 'mine.toml'}")
     assert table["appearance"]["density"]["start"] == 7
-    assert table["appearance"]["density"]["every"] == read_preset("quick")["appearance"]["density"]["every"]
+    assert table["appearance"]["density"]["every"] == preset_table("quick")["appearance"]["density"]["every"]
     with pytest.raises(DataError, match="no preset 'nosuch'"):
-        read_preset("quick,nosuch")
+        preset_table("quick,nosuch")

@@ -13,7 +13,6 @@ from tiny_avatar import tiny_avatar
 from mgavatar import cli
 from mgavatar.benchmarks import kernels as bench
 from mgavatar.benchmarks import kernels_work
-from mgavatar.driving.retarget import mean_pose
 from mgavatar.errors import DataError
 from mgavatar.kernels import bridge
 
@@ -48,7 +47,7 @@ def test_a_fitted_avatar_is_timed_as_it_is_drawn(tmp_path):
     avatar, _ = tiny_avatar(tmp_path)
     avatar.save(tmp_path / "avatar.pt")
     job = kernels_work.avatar_job(tmp_path / "avatar.pt", CPU)
-    drawn = avatar.render(mean_pose(avatar), avatar.capture.mean_camera(), background=torch.zeros(3))
+    drawn = avatar.render(avatar.mean_pose(), avatar.capture.mean_camera(), background=torch.zeros(3))
     assert drawn.alphas.mean() > 0.02
     assert loss_of(job.step) == pytest.approx(float(drawn.image.square().sum()), rel=1e-4)
     assert loss_of(job.plain) == pytest.approx(loss_of(job.step), rel=1e-4)

@@ -23,7 +23,7 @@ from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.errors import DataError
 from mgavatar.fitting.budget import GEOMETRY_SHARE, LEAST, Budget, TooShort, duration, geometry_share, parse_budget
-from mgavatar.fitting.fit import fit
+from mgavatar.fitting.fit import fit_avatar
 from mgavatar.fitting.loop import Interrupted
 from mgavatar.fitting.run import Run, open_run
 from mgavatar.geometry.stage import GeometryStage
@@ -253,7 +253,7 @@ def fit_into(
     """Fit the tiny subject on made-up time."""
     run = open_run(out, resume=resume)
     budget = Budget(seconds, clock=timed.clock) if seconds is not None else None
-    fit(subject, tiny_head(), config, run, device=torch.device("cpu"), resume=resume, budget=budget)
+    fit_avatar(subject, tiny_head(), config, run, device=torch.device("cpu"), resume=resume, budget=budget)
     return run
 
 

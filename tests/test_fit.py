@@ -22,9 +22,9 @@ from tiny import tiny_config, tiny_head
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.avatar import Avatar
 from mgavatar.capture.subject import Subject
-from mgavatar.config import FitConfig, from_dict
+from mgavatar.config import FitConfig, ResolvedConfig, from_dict
 from mgavatar.errors import DataError
-from mgavatar.fitting.fit import fit
+from mgavatar.fitting.fit import fit_avatar
 from mgavatar.fitting.loop import Interrupted
 from mgavatar.fitting.plan import plan
 from mgavatar.fitting.run import Run, open_run
@@ -40,7 +40,7 @@ def fit_into(
     """Fit the tiny subject; density control works at steps 4 and 8."""
     run = open_run(out, resume=resume)
     device = torch.device("cpu")
-    fit(subject, tiny_head(), config or tiny_config(), run, device=device, seed=seed, resume=resume)
+    fit_avatar(subject, tiny_head(), config or tiny_config(), run, device=device, seed=seed, resume=resume)
     return run
 
 
@@ -132,8 +132,8 @@ def test_what_is_in_the_folder(whole, subject):
     """Configuration, log, checkpoint and avatar; nothing half-written."""
     names = sorted(path.name for path in whole.folder.iterdir())
     assert names == ["avatar.pt", "checkpoint.pt", "config.toml", "metrics.jsonl", "summary.json"]
-    settled, _ = plan(tiny_config(), tiny_head(), subject)
-    assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text())) == settled
+    resolved, _ = plan(tiny_config(), tiny_head(), subject)
+    assert from_dict(tomllib.loads((whole.folder / "config.toml").read_text()), ResolvedConfig) == resolved
 
 
 def test_what_the_fit_took(whole):
@@ -319,11 +319,16 @@ def test_a_crash_costs_what_came_after_the_last_checkpoint(stage, step, whole, s
     assert differing(whole, resumed) == ["/config/checkpoint_minutes"]
 
 
-def test_a_loss_that_is_not_finite_stops_the_fit(subject, tmp_path):
+def test_a_loss_that_is_not_finite_stops_the_fit(subject, tmp_path, monkeypatch):
     """With the stage, the step and what to do."""
-    config = tiny_config(geometry={"lr_scale": 1e30})
+    step = GeometryStage.step
+
+    def diverged(stage: GeometryStage, *args: Any) -> dict[str, float]:
+        return step(stage, *args) | {"loss": float("nan")}
+
+    monkeypatch.setattr(GeometryStage, "step", diverged)
     with pytest.raises(DataError, match=r"geometry loss is not finite at iteration .*; lower the learning rates"):
-        fit_into(tmp_path / "run", subject, config=config)
+        fit_into(tmp_path / "run", subject)
     assert not (tmp_path / "run" / "avatar.pt").exists()
 
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, read_json, read_npz
-from mgavatar.head.load import load_head_model, save_head_model
+from mgavatar.head.load import read_head_model, save_head_model
 from mgavatar.head.model import HeadModel
 
 HEAD = ball_head()
@@ -82,8 +82,8 @@ def flame_folder(folder: Path, *, name: str = "generic_model.pkl", protocol: int
 def test_what_is_saved_is_loaded(tmp_path):
     save_head_model(tmp_path / "ball", HEAD)
     (tmp_path / "ball").rename(tmp_path / "ball.npz")
-    assert_same(load_head_model(tmp_path / "ball.npz"), HEAD, but=("name",))
-    assert load_head_model(tmp_path / "ball.npz").name == "ball.npz"
+    assert_same(read_head_model(tmp_path / "ball.npz"), HEAD, but=("name",))
+    assert read_head_model(tmp_path / "ball.npz").name == "ball.npz"
 
 
 def test_other_types_are_converted(tmp_path):
@@ -98,11 +98,11 @@ def test_other_types_are_converted(tmp_path):
         comment="ignored",
         things=np.array([{}], object),
     )
-    assert_same(load_head_model(path), HEAD, but=("name",))
+    assert_same(read_head_model(path), HEAD, but=("name",))
 
 
 def test_names_and_basis_are_optional(tmp_path):
-    head = load_head_model(edited(tmp_path / "head.npz", expr_names=None, expr_basis=None, mask_face=None))
+    head = read_head_model(edited(tmp_path / "head.npz", expr_names=None, expr_basis=None, mask_face=None))
     assert head.expr_basis == "unknown"
     assert head.expr_names == ()
     assert set(head.masks) == {"neck"}
@@ -111,7 +111,7 @@ def test_names_and_basis_are_optional(tmp_path):
 @pytest.mark.parametrize("key", ["vt", "ft"])
 def test_head_without_texture_coordinates(tmp_path, key):
     path = edited(tmp_path / "head.npz", **{key: None})
-    refusal(lambda: load_head_model(path), f"{path}: no texture coordinates (vt, ft); add vt (U, 2)")
+    refusal(lambda: read_head_model(path), f"{path}: no texture coordinates (vt, ft); add vt (U, 2)")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_head_without_texture_coordinates(tmp_path, key):
 )
 def test_incomplete_head(tmp_path, key):
     path = edited(tmp_path / "head.npz", **{key: None})
-    refusal(lambda: load_head_model(path), f"{path}: not a complete head model: {key} missing")
+    refusal(lambda: read_head_model(path), f"{path}: not a complete head model: {key} missing")
 
 
 @pytest.mark.parametrize(
@@ -165,17 +165,17 @@ def test_incomplete_head(tmp_path, key):
 )
 def test_inconsistent_head(tmp_path, changes, words):
     path = edited(tmp_path / "head.npz", **changes)
-    refusal(lambda: load_head_model(path), f"{path}: ", words)
+    refusal(lambda: read_head_model(path), f"{path}: ", words)
 
 
 def test_not_a_head(tmp_path):
-    refusal(lambda: load_head_model(tmp_path / "none.npz"), "none.npz: no such file")
-    refusal(lambda: load_head_model(tmp_path / "none.pkl"), "none.pkl: no such file")
-    refusal(lambda: load_head_model(tmp_path / "head.obj"), "head.obj: a head model is a .npz with FLAME's keys")
+    refusal(lambda: read_head_model(tmp_path / "none.npz"), "none.npz: no such file")
+    refusal(lambda: read_head_model(tmp_path / "none.pkl"), "none.pkl: no such file")
+    refusal(lambda: read_head_model(tmp_path / "head.obj"), "head.obj: a head model is a .npz with FLAME's keys")
     np.savez(tmp_path / "seq.npz", expr=np.zeros((3, 4)))
-    refusal(lambda: load_head_model(tmp_path / "seq.npz"), "seq.npz: not a head model: it has none of v_template")
+    refusal(lambda: read_head_model(tmp_path / "seq.npz"), "seq.npz: not a head model: it has none of v_template")
     (tmp_path / "folder.npz").mkdir()
-    refusal(lambda: load_head_model(tmp_path / "folder.npz"), "folder.npz: is a folder")
+    refusal(lambda: read_head_model(tmp_path / "folder.npz"), "folder.npz: is a folder")
 
 
 @pytest.mark.parametrize("file", ["FLAME_texture.npz", "flame_uv.npz", "head_template_mesh.obj"])
@@ -188,7 +188,7 @@ def test_flame_pickle_takes_uvs_from_beside(tmp_path, file):
         np.savez(
             path.with_name(file), vt=FLAME_HEAD.vt.astype(float), ft=FLAME_HEAD.ft.astype(np.uint32), mean=np.ones(9)
         )
-    head = load_head_model(path)
+    head = read_head_model(path)
     assert_same(head, FLAME_HEAD, but=("masks", "expr_basis", "expr_names", "name"))
     assert (head.n_shape, head.n_expr, head.expr_basis, head.name) == (300, 100, "flame2020", "generic_model.pkl")
     assert head.masks == {}
@@ -197,7 +197,7 @@ def test_flame_pickle_takes_uvs_from_beside(tmp_path, file):
 def test_flame_pickle_without_uvs_says_which_files_to_add(tmp_path):
     path = flame_folder(tmp_path / "flame")
     refusal(
-        lambda: load_head_model(path),
+        lambda: read_head_model(path),
         f"{path}: no texture coordinates (vt, ft)",
         "FLAME_texture.npz",
         "flame_uv.npz",
@@ -209,14 +209,14 @@ def test_uvs_beside_that_do_not_fit(tmp_path):
     path = flame_folder(tmp_path / "flame")
     obj, npz = path.with_name("head_template_mesh.obj"), path.with_name("flame_uv.npz")
     write_obj(obj, dataclasses.replace(FLAME_HEAD, faces=FLAME_HEAD.faces[::-1]))
-    refusal(lambda: load_head_model(path), f"{obj}: its faces are not those of the head, in the same order")
+    refusal(lambda: read_head_model(path), f"{obj}: its faces are not those of the head, in the same order")
     for line in ("f 1/1 2/2 3/3 4/4", "f 1 2 3", "f a/b c/d e/f", "vt 0.5", "f 1//1 2//2 3//3"):
         obj.write_text(line)
-        refusal(lambda: load_head_model(path), f"{obj}: not an OBJ of triangles with texture coordinates")
+        refusal(lambda: read_head_model(path), f"{obj}: not an OBJ of triangles with texture coordinates")
     np.savez(npz, vt=FLAME_HEAD.vt)
-    refusal(lambda: load_head_model(path), f"{npz}: no texture coordinates (vt, ft)")
+    refusal(lambda: read_head_model(path), f"{npz}: no texture coordinates (vt, ft)")
     np.savez(npz, vt=FLAME_HEAD.vt, ft=FLAME_HEAD.ft[1:])
-    refusal(lambda: load_head_model(path), f"{npz}: ft has 79 faces, but the head has 80")
+    refusal(lambda: read_head_model(path), f"{npz}: ft has 79 faces, but the head has 80")
 
 
 def test_flame_masks_beside(tmp_path):
@@ -225,7 +225,7 @@ def test_flame_masks_beside(tmp_path):
     masks = {"face": np.array([1, 5]), "left_eyeball": np.array([7]), "right_eyeball": np.array([9, 11])}
     beside = path.with_name("FLAME_masks.pkl")
     beside.write_bytes(dump(masks, protocol="python2", old_modules=True))
-    head = load_head_model(path)
+    head = read_head_model(path)
     assert {name: np.flatnonzero(mask).tolist() for name, mask in head.masks.items()} == {
         "face": [1, 5],
         "left_eyeball": [7],
@@ -233,9 +233,9 @@ def test_flame_masks_beside(tmp_path):
         "eyeballs": [7, 9, 11],
     }
     beside.write_bytes(dump({"face": np.array([42])}))
-    refusal(lambda: load_head_model(path), f"{beside}: face is no list of vertices of a head with 42")
+    refusal(lambda: read_head_model(path), f"{beside}: face is no list of vertices of a head with 42")
     beside.write_bytes(b"cos\nsystem\n(U\x02lstR.")
-    refusal(lambda: load_head_model(path), f"{beside}: refused, because it asks for os.system")
+    refusal(lambda: read_head_model(path), f"{beside}: refused, because it asks for os.system")
 
 
 @pytest.mark.parametrize(
@@ -253,17 +253,17 @@ def test_flame_masks_beside(tmp_path):
 def test_basis_by_name(tmp_path, name, basis):
     path = flame_folder(tmp_path / Path(name).parent, name=Path(name).name, protocol=4)
     write_obj(path.with_name("head_template_mesh.obj"), FLAME_HEAD, end="\n")
-    assert load_head_model(path).expr_basis == basis
+    assert read_head_model(path).expr_basis == basis
 
 
 def test_pickle_of_another_model(tmp_path):
     path = tmp_path / "head.pkl"
     path.write_bytes(dump(flame_content(HEAD)))
-    refusal(lambda: load_head_model(path), f"{path}: shapedirs has 7 directions, FLAME's pickles have 400")
+    refusal(lambda: read_head_model(path), f"{path}: shapedirs has 7 directions, FLAME's pickles have 400")
     path.write_bytes(dump({**flame_content(HEAD), "v_template": np.float64(1.0)}))
-    refusal(lambda: load_head_model(path), f"{path}: v_template has shape ()")
+    refusal(lambda: read_head_model(path), f"{path}: v_template has shape ()")
     path.write_bytes(dump({"f": np.arange(3)}))
-    refusal(lambda: load_head_model(path), f"{path}: not a complete head model: v_template, shapedirs")
+    refusal(lambda: read_head_model(path), f"{path}: not a complete head model: v_template, shapedirs")
 
 
 def test_npz_that_would_inflate_to_more_than_is_allowed(tmp_path):
@@ -296,7 +296,7 @@ def test_npz_headers_that_lie(tmp_path, header):
     member = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + bytes(8)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("v_template.npy", member)
-    refusal(lambda: load_head_model(path), f"{path}: ")
+    refusal(lambda: read_head_model(path), f"{path}: ")
 
 
 def test_unusual_compression_is_refused(tmp_path):
@@ -305,7 +305,7 @@ def test_unusual_compression_is_refused(tmp_path):
     np.save(stream, np.zeros(3))
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
         archive.writestr("v_template.npy", stream.getvalue())
-    refusal(lambda: load_head_model(path), f"{path}: v_template.npy is compressed in a way that numpy does not write")
+    refusal(lambda: read_head_model(path), f"{path}: v_template.npy is compressed in a way that numpy does not write")
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +331,7 @@ def test_damaged_npz_raises_data_errors(tmp_path, whole_file, data):
     path = tmp_path / "fuzz.npz"
     path.write_bytes(bytes(seed))
     try:
-        head = load_head_model(path)
+        head = read_head_model(path)
     except DataError as error:
         message = str(error)
     else:
@@ -367,7 +367,7 @@ def test_a_write_is_whole_or_absent(tmp_path):
 
 
 def test_real_head(real_data):
-    head = load_head_model(real_data / "head_models/ict_head.npz")
+    head = read_head_model(real_data / "head_models/ict_head.npz")
     assert (len(head.v_template), len(head.faces), head.n_shape, head.n_expr) == (16976, 33728, 100, 57)
     assert (head.expr_basis, len(head.expr_names), head.name) == ("unknown", 57, "ict_head.npz")
     np.testing.assert_array_equal(head.parents, [-1, 0, 1, 1, 1])

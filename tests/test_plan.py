@@ -16,10 +16,11 @@ from tiny import tiny_config, tiny_head
 
 from mgavatar.camera import look_at
 from mgavatar.capture.subject import Frame, Subject
-from mgavatar.config import FitConfig, from_dict, to_toml
+from mgavatar.config import FitConfig, from_dict, resolve
 from mgavatar.fitting.plan import Decision, plan
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
+from mgavatar.presets import to_toml
 
 EVERYTHING = {
     "geometry": {"subdivisions": "auto", "pose_offsets": "auto", "learn_jaw": "auto", "learn_eyes": "auto"},
@@ -84,25 +85,25 @@ def value(config: FitConfig, key: str) -> Any:
 
 def decided(key: str, subject: Subject, head: HeadModel | None = None, **more: Any) -> tuple[Any, str]:
     """What a plan for everything makes of a key, and what it says about it."""
-    config = from_dict(EVERYTHING)
+    config = from_dict(EVERYTHING, FitConfig)
     for name, given in more.items():
         part = getattr(config.appearance, name)
         changed = dataclasses.replace(part, **given) if isinstance(given, dict) else given
         config = dataclasses.replace(config, appearance=dataclasses.replace(config.appearance, **{name: changed}))
-    settled, decisions = plan(config, head or tiny_head(), subject)
+    resolved, decisions = plan(config, head or tiny_head(), subject)
     said = [str(decision) for decision in decisions if decision.key == key]
-    return value(settled, key), said[0] if said else ""
+    return value(resolved, key), said[0] if said else ""
 
 
 def test_nothing_is_left_open_and_everything_is_said():
     """No ``auto`` reaches what is built or stored; each line names its flag."""
-    settled, decisions = plan(from_dict(EVERYTHING), tiny_head(), made_up(jaw_pose=turned(0, 0, 5, 9)))
-    assert "auto" not in to_toml(settled)
-    keys = [f"{section}.{key}" for section in EVERYTHING for key in dataclasses.asdict(settled)[section]]
+    resolved, decisions = plan(from_dict(EVERYTHING, FitConfig), tiny_head(), made_up(jaw_pose=turned(0, 0, 5, 9)))
+    assert "auto" not in to_toml(resolved)
+    keys = [f"{section}.{key}" for section in EVERYTHING for key in dataclasses.asdict(resolved)[section]]
     assert {decision.key for decision in decisions} >= {"geometry.subdivisions", "appearance.colors"} & set(keys)
     assert len(decisions) == 10
     for decision in decisions:
-        assert value(settled, decision.key) == decision.value
+        assert value(resolved, decision.key) == decision.value
         assert re.search(r"\d|held|still", decision.reason), decision
         assert str(decision).endswith(f"(--{decision.key.replace('_', '-')})")
 
@@ -111,19 +112,19 @@ def test_what_the_user_says_stays():
     """A value of the user's is kept, whatever the capture, and not talked about."""
     subject = made_up(cameras=(0.0,), n_timesteps=1)
     config = tiny_config(geometry={"subdivisions": 2})
-    assert plan(config, tiny_head(), subject) == (config, ())
+    assert plan(config, tiny_head(), subject) == (resolve(config), ())
     table = {"geometry": {"subdivisions": "auto", "pose_offsets": True}}
-    settled, decisions = plan(from_dict(table), tiny_head(), subject)
+    resolved, decisions = plan(from_dict(table, FitConfig), tiny_head(), subject)
     assert [decision.key for decision in decisions] == ["geometry.subdivisions"]
-    assert settled.geometry.pose_offsets is True
-    assert settled.appearance == FitConfig().appearance
+    assert resolved.geometry.pose_offsets is True
+    assert dataclasses.asdict(resolved.appearance) == dataclasses.asdict(FitConfig().appearance)
 
 
-def test_a_plan_is_settled_for_good():
+def test_a_plan_is_resolved_for_good():
     """A plan of a plan changes nothing: a resumed fit has the configuration that the run wrote down."""
     subject = made_up(expr=[[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    settled, _ = plan(from_dict(EVERYTHING), tiny_head(), subject)
-    assert plan(settled, tiny_head(), subject) == (settled, ())
+    resolved, _ = plan(from_dict(EVERYTHING, FitConfig), tiny_head(), subject)
+    assert plan(resolved, tiny_head(), subject) == (resolved, ())
 
 
 def test_a_decision_in_words():
@@ -240,18 +241,18 @@ def test_a_camera_that_turns_with_the_head_has_one_direction():
     subject = made_up(cameras=(0.0, 30.0), n_timesteps=2, rotation=turned(1, 0, 30))
     follows = tuple(frame for frame in subject.frames["train"] if frame.camera_id == frame.timestep)
     subject = dataclasses.replace(subject, frames={**subject.frames, "train": follows})
-    settled, _ = plan(from_dict(EVERYTHING), tiny_head(), subject)
-    assert settled.appearance.colors == "sh"
-    assert settled.appearance.sh.degree == 0
+    resolved, _ = plan(from_dict(EVERYTHING, FitConfig), tiny_head(), subject)
+    assert resolved.appearance.colors == "sh"
+    assert resolved.appearance.sh.degree == 0
 
 
 def test_one_colour_a_gaussian_only_where_the_plan_says_so():
     """Harmonics that the user asks for keep their degree."""
     subject = made_up(cameras=(0.0,))
-    settled, _ = plan(from_dict({"appearance": {"colors": "sh"}}), tiny_head(), subject)
-    assert settled.appearance.sh.degree == FitConfig().appearance.sh.degree == 3
-    settled, _ = plan(from_dict(EVERYTHING), tiny_head(), made_up())
-    assert settled.appearance.sh.degree == 3
+    resolved, _ = plan(from_dict({"appearance": {"colors": "sh"}}, FitConfig), tiny_head(), subject)
+    assert resolved.appearance.sh.degree == FitConfig().appearance.sh.degree == 3
+    resolved, _ = plan(from_dict(EVERYTHING, FitConfig), tiny_head(), made_up())
+    assert resolved.appearance.sh.degree == 3
 
 
 @pytest.mark.parametrize(
@@ -282,12 +283,12 @@ def test_uv_maps_have_about_a_texel_a_pixel(focal, size, side):
     assert stated == pytest.approx(side, rel=0.05)  # the mesh is smaller than the ball around it
 
 
-def test_what_takes_no_part_is_settled_without_a_word():
+def test_what_takes_no_part_is_resolved_without_a_word():
     """Maps of a network that is left out, levels of a grid that is not there, rates of a stage that is switched off."""
-    config = from_dict(EVERYTHING)
+    config = from_dict(EVERYTHING, FitConfig)
     config = dataclasses.replace(config, geometry=dataclasses.replace(config.geometry, enabled=False))
-    settled, decisions = plan(config, tiny_head(), made_up(cameras=(0.0,), n_timesteps=1))
-    assert "auto" not in to_toml(settled)
+    resolved, decisions = plan(config, tiny_head(), made_up(cameras=(0.0,), n_timesteps=1))
+    assert "auto" not in to_toml(resolved)
     assert [decision.key for decision in decisions] == [
         "geometry.subdivisions",
         "appearance.colors",
@@ -297,7 +298,7 @@ def test_what_takes_no_part_is_settled_without_a_word():
 
 def test_head_tuning_is_told_what_it_holds():
     """Jaw and eyes matter to it even without a geometry stage; offsets by pose do not."""
-    config = from_dict(EVERYTHING | {"appearance": {"head_tuning": {"enabled": True}}})
+    config = from_dict(EVERYTHING | {"appearance": {"head_tuning": {"enabled": True}}}, FitConfig)
     config = dataclasses.replace(config, geometry=dataclasses.replace(config.geometry, enabled=False))
     _, decisions = plan(config, tiny_head(), made_up())
     assert [decision.key for decision in decisions] == [

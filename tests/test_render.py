@@ -22,11 +22,11 @@ from mgavatar.camera import look_at
 from mgavatar.capture.read import read_capture
 from mgavatar.driving.cameras import cameras_of
 from mgavatar.driving.motion import Driving, read_driving
-from mgavatar.driving.render import render_driving
-from mgavatar.driving.retarget import driving_notes, head_points, mean_pose, poses_of
+from mgavatar.driving.render import render
+from mgavatar.driving.retarget import driving_notes, head_points, poses_of
 from mgavatar.driving.writers import EMPTY_DEPTH, to_bytes, write_exr
 from mgavatar.errors import DataError
-from mgavatar.head.load import load_head_model
+from mgavatar.head.load import read_head_model
 from mgavatar.kernels.rasterize import Rendering
 
 N = 5
@@ -65,14 +65,14 @@ def test_full_head_motion_is_as_driven_around_the_avatars_own_place(avatar: Avat
     moved = _stack(poses, "translation") - driving.translation
     assert np.allclose(moved, moved[0], atol=1e-6)
     driven = head_points(avatar, driving.rotation, driving.neck_pose, _stack(poses, "translation"))
-    mean = mean_pose(avatar)
+    mean = avatar.mean_pose()
     own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck_pose, mean.translation)))
     assert np.allclose(driven.mean(axis=0), own[0], atol=1e-6)
 
 
 def test_neck_motion_keeps_the_shoulders_and_the_gaze(avatar: Avatar, driving: Driving) -> None:
     """The root stays at its training mean, and root and neck together turn as they do in the sequence."""
-    poses, mean = poses_of(avatar, driving, head_motion="neck"), mean_pose(avatar)
+    poses, mean = poses_of(avatar, driving, head_motion="neck"), avatar.mean_pose()
     assert np.allclose(_stack(poses, "rotation"), mean.rotation.numpy())
     assert np.allclose(_stack(poses, "translation"), mean.translation.numpy())
     turned = _composed(_stack(poses, "rotation"), _stack(poses, "neck_pose"))
@@ -80,7 +80,7 @@ def test_neck_motion_keeps_the_shoulders_and_the_gaze(avatar: Avatar, driving: D
 
 
 def test_no_head_motion_leaves_the_face_alone_to_move(avatar: Avatar, driving: Driving) -> None:
-    poses, mean = poses_of(avatar, driving, head_motion="none"), mean_pose(avatar)
+    poses, mean = poses_of(avatar, driving, head_motion="none"), avatar.mean_pose()
     assert np.allclose(_stack(poses, "rotation"), mean.rotation.numpy())
     assert np.allclose(_stack(poses, "neck_pose"), mean.neck_pose.numpy())
     assert np.allclose(_stack(poses, "jaw_pose"), driving.jaw_pose)
@@ -95,7 +95,7 @@ def test_a_part_of_a_sequence_is_placed_like_the_whole(avatar: Avatar, driving: 
 def test_mean_pose_averages_the_training_timesteps_only(avatar: Avatar) -> None:
     rows = list(avatar.capture.train_timesteps)
     assert len(rows) < len(avatar.capture.timestep_ids)
-    assert torch.allclose(mean_pose(avatar).translation, avatar.head.poses["translation"][rows].mean(0))
+    assert torch.allclose(avatar.mean_pose().translation, avatar.head.poses["translation"][rows].mean(0))
 
 
 def test_an_expression_of_another_basis_is_ignored_and_said(avatar: Avatar, driving: Driving) -> None:
@@ -121,7 +121,7 @@ def test_orbit_swings_the_mean_camera_both_ways_at_its_distance(avatar: Avatar) 
     for index in (1, 3):
         turn = cameras[index].viewmat[:3, :3] @ mean.viewmat[:3, :3].T
         assert np.degrees(Rotation.from_matrix(turn).magnitude()) == pytest.approx(40.0, abs=1e-3)
-    center = avatar.verts(mean_pose(avatar)).mean(0).numpy()
+    center = avatar.verts(avatar.mean_pose()).mean(0).numpy()
     distances = [np.linalg.norm(camera.position - center) for camera in cameras]
     assert np.allclose(distances, distances[0], atol=1e-6)
     assert cameras[1].position[0] > mean.position[0] > cameras[3].position[0]
@@ -183,7 +183,7 @@ def test_png_folder(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     done = []
     out = tmp_path / "frames"
     out.mkdir()  # an empty folder is as good as none
-    notes = render_driving(avatar, driving, out=out, progress=lambda *at: done.append(at))
+    notes = render(avatar, driving, out=out, progress=lambda *at: done.append(at))
     assert sorted(file.name for file in out.iterdir()) == [f"{index:05d}.png" for index in range(N)]
     assert done == [(index + 1, N) for index in range(N)]
     assert len(notes) == 1
@@ -195,7 +195,7 @@ def test_png_folder(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
 def test_mp4_round_trip(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     """Number, rate and colours of the frames survive, odd sizes are padded, and BT.709 is declared."""
     out = tmp_path / "clip.mp4"
-    render_driving(avatar, driving, out=out, size=(73, 65), head_motion="none")
+    render(avatar, driving, out=out, size=(73, 65), head_motion="none")
     with av.open(str(out)) as container:
         stream = container.streams.video[0]
         context = stream.codec_context
@@ -210,7 +210,7 @@ def test_mp4_round_trip(avatar: Avatar, driving: Driving, tmp_path: Path) -> Non
 
 def test_gif_round_trip(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     out = tmp_path / "clip.gif"
-    render_driving(avatar, driving, out=out, frames=slice(0, 3))
+    render(avatar, driving, out=out, frames=slice(0, 3))
     with Image.open(out) as image:
         assert (image.n_frames, image.size, image.info["duration"]) == (3, (24, 32), 80)
         center = np.asarray(image.convert("RGB"))[16, 12]
@@ -238,7 +238,7 @@ def test_exr_values_are_linear_premultiplied_with_depth(tmp_path: Path) -> None:
 
 def test_exr_folder_has_no_background(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     out = tmp_path / "frames"
-    render_driving(avatar, driving, out=out, format="exr", frames=slice(0, 1))
+    render(avatar, driving, out=out, format="exr", frames=slice(0, 1))
     with OpenEXR.File(str(out / "00000.exr"), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     assert channels["A"][0, 0] == channels["R"][0, 0] == 0
@@ -249,16 +249,19 @@ def test_exr_folder_has_no_background(avatar: Avatar, driving: Driving, tmp_path
 
 def test_only_files_of_the_same_kind_are_replaced(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     clip, foreign, folder = tmp_path / "clip.mp4", tmp_path / "notes.gif", tmp_path / "folder"
-    render_driving(avatar, driving, out=clip, frames=slice(0, 1))
+    render(avatar, driving, out=clip, frames=slice(0, 1))
     first = clip.read_bytes()
-    render_driving(avatar, driving, out=clip, frames=slice(0, 2))
+    with pytest.raises(DataError, match="--overwrite"):
+        render(avatar, driving, out=clip, frames=slice(0, 2))
+    assert clip.read_bytes() == first
+    render(avatar, driving, out=clip, frames=slice(0, 2), overwrite=True)
     assert clip.read_bytes() != first
     foreign.write_text("my notes")
     folder.mkdir()
     (folder / "mine.txt").write_text("mine")
     for out, message in ((foreign, "not a .gif file"), (folder, "not an empty folder")):
         with pytest.raises(DataError, match=message):
-            render_driving(avatar, driving, out=out)
+            render(avatar, driving, out=out)
     assert foreign.read_text() == "my notes"
     assert (folder / "mine.txt").read_text() == "mine"
 
@@ -276,7 +279,7 @@ def test_impossible_outputs_are_refused(
     avatar: Avatar, driving: Driving, tmp_path: Path, name: str, format: str, message: str
 ) -> None:
     with pytest.raises(DataError, match=message):
-        render_driving(avatar, driving, out=tmp_path / name, format=format)  # type: ignore[arg-type]
+        render(avatar, driving, out=tmp_path / name, format=format)  # type: ignore[arg-type]
 
 
 def test_without_pyav_nothing_is_begun(
@@ -285,7 +288,7 @@ def test_without_pyav_nothing_is_begun(
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(avatar, "render", lambda *_: pytest.fail("work was begun"))
     with pytest.raises(DataError, match=r"pip install mgavatar\[video\]"):
-        render_driving(avatar, driving, out=tmp_path / "clip.mp4")
+        render(avatar, driving, out=tmp_path / "clip.mp4")
 
 
 @pytest.mark.parametrize("name", ["clip.mp4", "clip.gif", "frames"])
@@ -297,23 +300,23 @@ def test_an_interrupted_rendering_leaves_nothing(avatar: Avatar, driving: Drivin
     folder = tmp_path / "out"
     folder.mkdir()
     with pytest.raises(KeyboardInterrupt):
-        render_driving(avatar, driving, out=folder / name, progress=stop)
+        render(avatar, driving, out=folder / name, progress=stop)
     assert list(folder.iterdir()) == []
 
 
 def test_no_frames_and_frames_out_of_the_picture_are_said(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no frames are left of its 5"):
-        render_driving(avatar, driving, out=tmp_path / "none", frames=slice(9, None))
+        render(avatar, driving, out=tmp_path / "none", frames=slice(9, None))
     away = driving.translation.copy()
     away[0] += 50.0
-    notes = render_driving(avatar, replace(driving, translation=away), out=tmp_path / "far")
+    notes = render(avatar, replace(driving, translation=away), out=tmp_path / "far")
     assert "outside the picture in 5 of 5 frames" in notes[-1]
 
 
 @pytest.fixture(scope="module")
 def real_avatar(real_data: Path) -> Avatar:
     subject = read_capture(real_data / "subjects/lps_multiview")
-    return avatar_on(subject, load_head_model(real_data / "head_models/ict_head.npz"))
+    return avatar_on(subject, read_head_model(real_data / "head_models/ict_head.npz"))
 
 
 @pytest.mark.parametrize("name", ["seq_a", "seq_b", "seq_c"])

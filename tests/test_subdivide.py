@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from ball_head import ball_head
 
-from mgavatar.head.load import load_head_model
+from mgavatar.head.load import read_head_model
 from mgavatar.head.model import HeadModel
 from mgavatar.head.subdivide import subdivide
 
@@ -107,7 +107,7 @@ def test_flame_sized_head_takes_less_than_two_seconds():
 
 
 def test_real_head(real_data):
-    head = load_head_model(real_data / "head_models/ict_head.npz")
+    head = read_head_model(real_data / "head_models/ict_head.npz")
     fine, parents = subdivide(head)
     assert len(fine.faces) == 4 * len(head.faces)
     np.testing.assert_allclose(fine.v_template, head.v_template[parents].mean(axis=1), atol=1e-7)

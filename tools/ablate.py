@@ -29,8 +29,8 @@ from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
-from mgavatar.config import read_preset
 from mgavatar.errors import DataError
+from mgavatar.presets import preset_table
 from mgavatar.reporting.markdown import markdown_table
 
 # Nothing heavy is imported before the last fit has ended: a child's peak memory is at least that of its parent.
@@ -90,7 +90,7 @@ class Cell:
     def conditions(self) -> dict[str, Any]:
         """Return the conditions that an existing cell must have been made under."""
         return {
-            "preset": read_preset(self.preset),
+            "preset": preset_table(self.preset),
             "data": str(self.data.resolve()),
             "head_model": str(self.head_model.resolve()) if self.head_model else None,
             "seed": self.seed,

@@ -11,7 +11,7 @@ import torch
 from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.capture.read import read_capture
-from mgavatar.config import FitConfig, from_dict, read_preset, settled
+from mgavatar.config import FitConfig
 from mgavatar.fitting.plan import plan
 from mgavatar.fitting.stage import Stage
 from mgavatar.fitting.views import Views
@@ -20,6 +20,7 @@ from mgavatar.geometry.stage import GeometryStage
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
 from mgavatar.head.procedural.build import build_head
+from mgavatar.presets import preset
 from mgavatar.synthetic.capture import make_synthetic_capture
 
 WARM_UP = 30
@@ -45,7 +46,7 @@ class Size:
 
 def sizes() -> Iterator[Size]:
     """``quick``, ``balanced`` and ``paper``, without anything that a capture has to settle."""
-    quick = from_dict(read_preset("quick"))
+    quick = preset("quick")
     paper = FitConfig()
     a = paper.appearance
     balanced = replace(
@@ -76,7 +77,7 @@ class Bench:
         self.config, _ = plan(size.config, head_model, subject)
         self.background = torch.tensor(subject.background, device=device)
         self.views = Views.of(subject, 8192, with_masks=self.config.random_background)
-        body = Body(head_model, subdivisions=settled(self.config.geometry.subdivisions), device=device)
+        body = Body(head_model, subdivisions=self.config.geometry.subdivisions, device=device)
         self.head = PersonalHead(body, subject.params, self.config.geometry)
 
     def step(self, stage: Stage, iteration: int) -> None:

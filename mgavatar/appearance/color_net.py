@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from mgavatar.config import ColorNetConfig, settled
+from mgavatar.config import ResolvedColorNetConfig
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.mlp import linear_layers, mlp
 
@@ -12,7 +12,7 @@ from mgavatar.kernels.mlp import linear_layers, mlp
 class ColorNet(nn.Module):
     """Colour of a Gaussian from its canonical position and the direction that it is seen from."""
 
-    def __init__(self, low: Tensor, high: Tensor, config: ColorNetConfig, *, seed: int) -> None:
+    def __init__(self, low: Tensor, high: Tensor, config: ResolvedColorNetConfig, *, seed: int) -> None:
         """The field covers the box from ``low`` to ``high`` [m], each shape [3]."""
         super().__init__()
         self.low: Tensor
@@ -20,9 +20,9 @@ class ColorNet(nn.Module):
         self.register_buffer("low", low)
         self.register_buffer("size", high - low)
         shape = HashGridShape(
-            levels=settled(config.levels),
+            levels=config.levels,
             base_resolution=config.base_resolution,
-            max_resolution=settled(config.max_resolution),
+            max_resolution=config.max_resolution,
             log2_table_size=config.log2_table_size,
         )
         self.grid = HashGrid(shape, seed=seed)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import AppearanceConfig
+from mgavatar.config import ResolvedAppearanceConfig
 from mgavatar.kernels.binding import place_on_faces
 from mgavatar.kernels.face_frames import face_frames
 
@@ -46,7 +46,7 @@ class FaceFrames:
 class FaceGaussians(nn.Module):
     """One Gaussian a face at first, at its centre; density control adds and removes others."""
 
-    def __init__(self, n_faces: int, config: AppearanceConfig, device: torch.device) -> None:
+    def __init__(self, n_faces: int, config: ResolvedAppearanceConfig, device: torch.device) -> None:
         super().__init__()
         self.n_faces = n_faces
         along, across = config.initial_scale, config.initial_thickness

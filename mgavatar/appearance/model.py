@@ -13,7 +13,7 @@ from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, FaceGauss
 from mgavatar.appearance.offset_net import OffsetNet
 from mgavatar.appearance.spherical_harmonics import sh_colors
 from mgavatar.camera import Camera
-from mgavatar.config import FitConfig, settled
+from mgavatar.config import ResolvedConfig
 from mgavatar.gaussians import Gaussians
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.params import Pose
@@ -75,10 +75,15 @@ class FrozenHead:
         center, half = (self.low + self.high) / 2, (self.high - self.low).max() / 2
         return position_map(self._uv, (verts - center) / half)
 
-    def posed(self, pose: Pose) -> PosedMesh:
-        """The head in any pose, differentiable in it."""
+    def posed(self, pose: Pose, *, maps_grad: bool = False) -> PosedMesh:
+        """Return the head in any pose, differentiable in it.
+
+        Args:
+            pose: The pose.
+            maps_grad: Keep the gradient through OffsetNet's inputs too; training does without it.
+        """
         verts = self.head.posed(pose).verts
-        with torch.no_grad():
+        with torch.set_grad_enabled(maps_grad and torch.is_grad_enabled()):
             still = self.head.posed(pose.without_root()).verts if self._uv is not None else verts
             theta = pose.joint_rotations().reshape(-1)
             pose_map = self._map(still)
@@ -98,7 +103,7 @@ class FrozenHead:
 class Appearance(nn.Module):
     """Face-bound Gaussians with ColorNet (or spherical harmonics) and OffsetNet."""
 
-    def __init__(self, frozen: FrozenHead, config: FitConfig, *, seed: int) -> None:
+    def __init__(self, frozen: FrozenHead, config: ResolvedConfig, *, seed: int) -> None:
         super().__init__()
         a = config.appearance
         self.frozen = frozen
@@ -183,8 +188,8 @@ class Appearance(nn.Module):
         return Gaussians(means, quats, scales, opacities, colors), offsets[0] if offsets else None
 
 
-def build_appearance(head: PersonalHead, config: FitConfig, *, seed: int) -> Appearance:
+def build_appearance(head: PersonalHead, config: ResolvedConfig, *, seed: int) -> Appearance:
     """Freeze the head and bind one Gaussian to each of its faces."""
     offset_net = config.appearance.offset_net
-    frozen = FrozenHead(head, uv_resolution=settled(offset_net.resolution) if offset_net.enabled else None)
+    frozen = FrozenHead(head, uv_resolution=offset_net.resolution if offset_net.enabled else None)
     return Appearance(frozen, config, seed=seed)

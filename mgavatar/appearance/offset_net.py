@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import OffsetNetConfig, settled
+from mgavatar.config import ResolvedOffsetNetConfig
 from mgavatar.kernels.binding import N_OFFSETS
 
 N_THETA = 15
@@ -23,9 +23,9 @@ class OffsetNet(nn.Module):
     5 layers, and its last one also sees the embedded maps at full resolution. It starts at zero offsets.
     """
 
-    def __init__(self, config: OffsetNetConfig) -> None:
+    def __init__(self, config: ResolvedOffsetNetConfig) -> None:
         super().__init__()
-        size, c = settled(config.resolution), config.channels
+        size, c = config.resolution, config.channels
         self.latent = nn.Parameter(0.1 * torch.randn(3, size, size))
         self.embed = _conv(9, c // 2)
         self.encoder = nn.Sequential(

@@ -11,12 +11,14 @@ from mgavatar.appearance.density import DensityControl
 from mgavatar.appearance.face_gaussians import SH_PARAMETERS
 from mgavatar.appearance.model import Appearance, PosedMesh
 from mgavatar.camera import Camera
-from mgavatar.config import AppearanceConfig, FitConfig
+from mgavatar.config import ResolvedAppearanceConfig, ResolvedConfig
 from mgavatar.gaussians import draw
 from mgavatar.losses import image_loss
 
 
-def binding_loss(local_means: Tensor, local_scales: Tensor, visible: Tensor, config: AppearanceConfig) -> Tensor:
+def binding_loss(
+    local_means: Tensor, local_scales: Tensor, visible: Tensor, config: ResolvedAppearanceConfig
+) -> Tensor:
     """The two hinges of Eq. 11: Gaussians stay near their face and of its size, with free room below epsilon.
 
     Both are norms over a Gaussian's three axes in units of k, averaged over the Gaussians that the view touches.
@@ -35,7 +37,7 @@ class AppearanceStage:
 
     name = "appearance"
 
-    def __init__(self, appearance: Appearance, config: FitConfig, *, seed: int) -> None:
+    def __init__(self, appearance: Appearance, config: ResolvedConfig, *, seed: int) -> None:
         self.appearance = appearance
         self.config = config
         a = config.appearance

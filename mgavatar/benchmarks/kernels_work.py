@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.benchmarks.machine import Machine
-from mgavatar.driving.retarget import mean_pose
 from mgavatar.kernels import binding, face_frames, laplacian, lbs, uv_map
 from mgavatar.kernels.hash_grid import HashGrid, HashGridShape
 from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, project, rasterize
@@ -139,7 +138,7 @@ def avatar_job(path: Path, device: torch.device) -> Job:
     """
     avatar = Avatar.load(path, device=device)
     camera = avatar.capture.mean_camera()
-    gaussians = avatar.gaussians(mean_pose(avatar), camera)
+    gaussians = avatar.gaussians(avatar.mean_pose(), camera)
     leaves = tuple(
         tensor.detach().clone().requires_grad_()
         for tensor in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)

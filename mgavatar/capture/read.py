@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from mgavatar.capture.readers import vhap
-from mgavatar.capture.readers.vhap import Background
 from mgavatar.capture.subject import Subject
-from mgavatar.capture.transforms import PrincipalPoint
+from mgavatar.config import Background, PrincipalPoint
 
 
 def read_capture(
-    root: Path, *, background: Background = "white", principal_point: PrincipalPoint = "center"
+    root: Path | str, *, background: Background = "white", principal_point: PrincipalPoint = "center"
 ) -> Subject:
     """Read a capture's calibration and parameters, and check that every file it names is there.
 
@@ -31,4 +30,4 @@ def read_capture(
     Raises:
         DataError: If something is missing or inconsistent; the message names the file.
     """
-    return vhap.read(root, background=background, principal_point=principal_point)
+    return vhap.read(Path(root), background=background, principal_point=principal_point)

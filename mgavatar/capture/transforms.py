@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from mgavatar.camera import Camera
+from mgavatar.config import PrincipalPoint
 from mgavatar.errors import DataError
 from mgavatar.files import one_line, path_inside
-
-PrincipalPoint = Literal["center", "opencv", "opengl"]
 
 MAX_PIXELS = 64_000_000
 

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
 from mgavatar.capture.transforms import FrameReader, camera_of_frame
-from mgavatar.driving.retarget import mean_pose
 from mgavatar.errors import DataError
 from mgavatar.files import read_json
 
@@ -75,7 +74,7 @@ def _orbit(avatar: Avatar, n_frames: int) -> list[Camera]:
 
 def turned_cameras(avatar: Avatar, camera: Camera, yaws: Iterable[float]) -> list[Camera]:
     """A camera carried rigidly around the upright axis of the head in its mean pose, by each yaw [degrees]."""
-    pose = mean_pose(avatar)
+    pose = avatar.mean_pose()
     center = avatar.verts(pose).mean(dim=0).cpu().numpy().astype(np.float64)
     up = Rotation.from_rotvec(pose.rotation.numpy()).apply([0.0, 1.0, 0.0])
     cameras = []

@@ -42,7 +42,7 @@ class Driving(HeadParams):
     notes: tuple[str, ...] = ()
 
 
-def read_driving(path: Path) -> Driving:
+def read_driving(path: Path | str) -> Driving:
     """Read a driving sequence in VHAP's keys.
 
     Missing keys are zero and identity is not read. An array of one row holds for all frames. A folder is read as one
@@ -57,6 +57,7 @@ def read_driving(path: Path) -> Driving:
     Raises:
         DataError: If there is no motion in it, or arrays are damaged, not finite, or of different lengths.
     """
+    path = Path(path)
     if not path.is_dir():
         return _read_file(path)
     folder = path / "flame_param" if (path / "flame_param").is_dir() else path

@@ -18,20 +18,21 @@ from mgavatar.errors import DataError
 from mgavatar.head.params import Pose
 
 
-def render_driving(
+def render(
     avatar: Avatar,
     driving: Driving,
     *,
-    out: Path,
+    out: Path | str,
     camera: str = "mean",
     head_motion: HeadMotion = "full",
     expression: ExpressionMode = "auto",
     format: Format = "auto",
     size: tuple[int, int] | None = None,
     frames: slice | None = None,
+    overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Draw an avatar in every pose of a driving sequence.
+    """Draw an avatar in every pose of a driving sequence, into a video or a folder of images.
 
     Args:
         avatar: The avatar.
@@ -42,7 +43,8 @@ def render_driving(
         expression: What to do with the expression columns; see :func:`mgavatar.driving.driving_expression`.
         format: ``"auto"`` goes by the name of ``out``.
         size: Width and height [px]; the camera's own if None.
-        frames: Which frames; all if None.
+        frames: Frames to draw; all if None.
+        overwrite: Replace a file of the same kind that is there already.
         progress: Called with the number of frames drawn and their total.
 
     Returns:
@@ -51,7 +53,8 @@ def render_driving(
     Raises:
         DataError: If ``out`` cannot be written there, the camera is unknown, or no frame is left.
     """
-    kind = kind_of(out, format)
+    out = Path(out)
+    kind = kind_of(out, format, overwrite=overwrite)
     poses = poses_of(avatar, driving, head_motion=head_motion, expression=expression, frames=frames)
     if not poses:
         raise DataError(f"{driving.path}: no frames are left of its {len(driving)}; choose other frames")

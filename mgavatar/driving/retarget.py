@@ -123,7 +123,7 @@ def poses_of(
     Returns:
         Poses on the CPU. The means are those of all frames, whatever ``frames`` says.
     """
-    mean = mean_pose(avatar)
+    mean = avatar.mean_pose()
     expr = _expression(avatar, driving, expression)[0]
     rotation, neck = driving.rotation, driving.neck_pose
     if head_motion == "full":
@@ -160,25 +160,6 @@ def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
     own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck_pose, mean.translation)))
     driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
     return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)
-
-
-def mean_pose(avatar: Avatar) -> Pose:
-    """Root, neck and translation averaged over the training timesteps; the rest is neutral. On the CPU."""
-    rows = list(avatar.capture.train_timesteps)
-    poses = {name: value.detach().cpu().numpy() for name, value in avatar.head.poses.items()}
-    n_expr = avatar.head_model.n_expr
-    return Pose(
-        expr=torch.zeros(n_expr),
-        rotation=_mean_rotation(poses["rotation"][rows]),
-        neck_pose=_mean_rotation(poses["neck_pose"][rows]),
-        jaw_pose=torch.zeros(3),
-        eyes_pose=torch.zeros(6),
-        translation=torch.from_numpy(poses["translation"][rows].mean(axis=0)),
-    )
-
-
-def _mean_rotation(vectors: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(Rotation.from_rotvec(vectors).mean().as_rotvec()).float()
 
 
 def _expression(avatar: Avatar, driving: Driving, mode: ExpressionMode) -> tuple[np.ndarray, str | None]:

@@ -49,12 +49,13 @@ def to_bytes(image: Tensor) -> np.ndarray:
     return (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
-def kind_of(out: Path, format: Format = "auto") -> FileKind:
+def kind_of(out: Path, format: Format = "auto", *, overwrite: bool = False) -> FileKind:
     """Decide what to write at ``out``, and check that it can be written there without harm to other files.
 
     Args:
         out: A name ending in ``.mp4`` or ``.gif``, else a folder.
         format: ``"auto"`` goes by the name; a folder then holds PNG.
+        overwrite: Replace a video of the same kind.
 
     Returns:
         The kind of file.
@@ -73,11 +74,21 @@ def kind_of(out: Path, format: Format = "auto") -> FileKind:
         raise DataError(f"{out}: give a name ending in .mp4 or .gif, or a folder (of PNG; of EXR with --format exr)")
     if kind == "mp4" and importlib.util.find_spec("av") is None:
         raise DataError(f"{out}: writing video needs PyAV: pip install mgavatar[video], or write a .gif or a folder")
-    _check_replaceable(out, kind)
+    _check_replaceable(out, kind, overwrite=overwrite)
     return kind
 
 
-def _check_replaceable(out: Path, kind: FileKind) -> None:
+def default_name(driving: Path, format: Format = "auto") -> Path:
+    """Return the name that a rendering gets in the working folder, after the motion that drives it.
+
+    It is a video where PyAV is installed and else a GIF, or the name of a folder if ``format`` is one of single images.
+    """
+    if format in ("png", "exr"):
+        return Path(driving.stem)
+    return Path(f"{driving.stem}.mp4" if format == "mp4" or importlib.util.find_spec("av") else f"{driving.stem}.gif")
+
+
+def _check_replaceable(out: Path, kind: FileKind, *, overwrite: bool) -> None:
     if not out.parent.is_dir():
         raise DataError(f"{out}: the folder {out.parent} does not exist; make it first")
     if kind in ("png", "exr"):
@@ -87,6 +98,8 @@ def _check_replaceable(out: Path, kind: FileKind) -> None:
         offset, magic = _MAGIC[kind]
         if not out.is_file() or _first_bytes(out)[offset : offset + len(magic)] != magic:
             raise DataError(f"{out}: already there and not a .{kind} file; remove it or give another name")
+        if not overwrite:
+            raise DataError(f"{out}: exists; give --out another name, or --overwrite to replace it")
 
 
 def _first_bytes(path: Path) -> bytes:

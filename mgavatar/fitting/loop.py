@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import signal
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
@@ -16,7 +17,7 @@ import torch
 from torch import Tensor
 
 from mgavatar.avatar import Avatar
-from mgavatar.config import FitConfig, to_toml
+from mgavatar.config import ResolvedConfig
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write
 from mgavatar.fitting.budget import Budget, Pacer, duration, geometry_share
@@ -24,7 +25,8 @@ from mgavatar.fitting.run import Run
 from mgavatar.fitting.stage import Stage
 from mgavatar.fitting.summary import Summary
 from mgavatar.fitting.views import ViewOrder, Views
-from mgavatar.progress import MetricsLog, Reporter
+from mgavatar.presets import to_toml
+from mgavatar.progress import FitProgress, MetricsLog
 
 log = logging.getLogger("mgavatar")
 
@@ -34,99 +36,145 @@ _CLOSE = 1e-6
 
 
 class Interrupted(Exception):
-    """The user pressed Ctrl-C; the avatar has been saved."""
+    """The fit was stopped by Ctrl-C or by its caller; the avatar as far as it came has been saved.
+
+    Attributes:
+        avatar: The avatar as far as it came.
+    """
+
+    def __init__(self, message: str, avatar: Avatar) -> None:
+        super().__init__(message)
+        self.avatar = avatar
 
 
 class _StopRequest:
-    """Turns the first Ctrl-C into a request, so that a step is never cut in two; the second one stops at once."""
+    """Turn the first Ctrl-C into a request, so that a step is never cut in two; the second one stops at once.
 
-    def __init__(self) -> None:
-        self.requested = False
+    Only the main thread receives signals; elsewhere the caller's ``stop`` is the only request.
+    """
+
+    def __init__(self, stop: Callable[[], bool] | None) -> None:
+        self._stop = stop
+        self._interrupted = False
+        self._handles_signals = threading.current_thread() is threading.main_thread()
+
+    @property
+    def requested(self) -> bool:
+        return self._interrupted or (self._stop is not None and self._stop())
 
     def __enter__(self) -> _StopRequest:
-        self.previous = signal.signal(signal.SIGINT, self._request)
+        if self._handles_signals:
+            self._previous = signal.signal(signal.SIGINT, self._request)
         return self
 
     def _request(self, number: int, frame: FrameType | None) -> None:
-        self.requested = True
+        self._interrupted = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self.previous)
+        if self._handles_signals:
+            signal.signal(signal.SIGINT, self._previous)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, kw_only=True)
 class Loop:
-    """Views in random order through a stage, with progress, log and checkpoints."""
+    """Show the views in random order to a stage, with progress, log and checkpoints.
 
-    config: FitConfig
-    run: Run
+    Attributes:
+        config: The fit's configuration.
+        run: Files of the fit, or None to write nothing.
+        log: Receives the terms of the losses.
+        background: Colour behind the subject in the images, shape [3], on the fit's device.
+        seed: Seed of the order of views and of the random backgrounds.
+        summary: Receives time and iterations of each stage.
+        budget: Time of the whole fit, or None.
+        checkpoint: Contents of the checkpoint that the fit continues from, or None.
+        progress: Called after every iteration, or None.
+        stop: Asked after every iteration whether to stop, or None.
+        finished: States of the stages that are done, which later checkpoints hold too.
+    """
+
+    config: ResolvedConfig
+    run: Run | None
     log: MetricsLog
     background: Tensor
     seed: int
     summary: Summary
     budget: Budget | None
-    fresh: bool
+    checkpoint: dict[str, Any] | None
+    progress: Callable[[FitProgress], None] | None = None
+    stop: Callable[[], bool] | None = None
+    finished: dict[str, Any] = field(default_factory=dict)
 
-    def run_stage(
-        self,
-        stage: Stage,
-        read_views: Callable[[], Views],
-        avatar: Avatar,
-        *,
-        done: int,
-        state: Callable[[], dict[str, Any]],
-    ) -> None:
-        """Iterations ``done`` + 1 to the last; ``state`` is what a checkpoint holds besides its place."""
-        if finished(stage):
-            return
-        views = read_views()
+    def run_stage(self, stage: Stage, read_views: Callable[[], Views], avatar: Avatar, *, done: int) -> None:
+        """Run a stage from iteration ``done`` + 1 to its end.
+
+        Args:
+            stage: The stage.
+            read_views: Decodes the training images; not called if the stage is done.
+            avatar: The avatar that this stage changes, saved when the fit is stopped.
+            done: Iterations of the stage that its state already holds.
+
+        Raises:
+            Interrupted: If the fit was stopped.
+            DataError: If the loss is not finite or a file cannot be written.
+        """
+        if not is_finished(stage):
+            self._iterate(stage, read_views(), avatar, done=done)
+        self.finished[stage.name] = stage.state_dict()
+
+    def _iterate(self, stage: Stage, views: Views, avatar: Avatar, *, done: int) -> None:
         order = iter(ViewOrder(len(views.images), self.seed))
-        for _ in range(done):
+        for _ in range(done):  # the order continues where the checkpoint left it
             next(order)
         pacer = self._pacer(stage)
-        iteration, total = done, stage.iterations
+        iteration = done
         started = noted = saved = time.monotonic()
-        with Reporter(stage.name, stage.iterations, done=done) as reporter, _StopRequest() as stop:
-            while not finished(stage):
+        with _StopRequest(self.stop) as stop:
+            while not is_finished(stage):
                 iteration += 1
                 schedule_step = 1.0 if pacer is None else pacer.schedule_step(stage.position)
-                view = next(order)
-                background = self._background(iteration) if views.masks is not None else self.background
-                target = views.target(view, self.background, background)
-                terms = stage.step(views.cameras[view], views.timesteps[view], target, background, schedule_step)
-                if not np.isfinite(terms["loss"]):
-                    raise DataError(
-                        f"{self.run.folder}: the {stage.name} loss is not finite at iteration {iteration}; "
-                        "lower the learning rates"
-                    )
+                terms = self._step(stage, views, next(order), iteration, schedule_step)
                 total = iteration + math.ceil((stage.iterations - stage.position) / schedule_step - _CLOSE)
                 if pacer is not None and pacer.calibrated:
                     self._log_pace(stage, total, pacer)
-                note = f"loss {terms['loss']:.4f}  {int(terms['gaussians'])} Gaussians"
-                reporter.update(iteration, note, total=total)
+                if self.progress is not None:
+                    self.progress(FitProgress(stage.name, iteration, total, terms))
                 now = time.monotonic()
-                if iteration % self.config.log_every == 0 or finished(stage):
+                requested, last = stop.requested, is_finished(stage)
+                if last or iteration % self.config.log_every == 0:
                     self.log.write(stage=stage.name, iteration=iteration, seconds=round(now - started, 3), **terms)
-                if now - saved > 60.0 * self.config.checkpoint_minutes or stop.requested or finished(stage):
+                if last or requested or now - saved > 60.0 * self.config.checkpoint_minutes:
                     self.summary.stage(
                         stage.name, iterations=iteration, configured=stage.iterations, seconds=now - noted
                     )
-                    self._save(stage, iteration, state)
+                    self._save(stage, iteration)
                     noted, saved = now, time.monotonic()
-                if stop.requested:
-                    avatar.save(self.run.avatar)
-                    raise Interrupted(f"stopped in {stage.name} at {iteration}/{total}")
+                if requested:
+                    if self.run is not None:
+                        avatar.save(self.run.avatar)
+                    raise Interrupted(f"stopped in {stage.name} at {iteration}/{total}", avatar)
+
+    def _step(self, stage: Stage, views: Views, view: int, iteration: int, schedule_step: float) -> dict[str, float]:
+        background = self._background(iteration) if views.masks is not None else self.background
+        target = views.target(view, self.background, background)
+        terms = stage.step(views.cameras[view], views.timesteps[view], target, background, schedule_step)
+        if not np.isfinite(terms["loss"]):
+            where = f"{self.run.folder}: " if self.run is not None else ""
+            raise DataError(
+                f"{where}the {stage.name} loss is not finite at iteration {iteration}; lower the learning rates"
+            )
+        return terms
 
     def _pacer(self, stage: Stage) -> Pacer | None:
         if self.budget is None:
             return None
         first = stage.name == "geometry" or not self.config.geometry.enabled
         share = geometry_share(stage.position / stage.iterations) if stage.name == "geometry" else 1.0
-        return self.budget.pacer(stage.iterations, share=share, must_fit=first and self.fresh)
+        return self.budget.pacer(stage.iterations, share=share, must_fit=first and self.checkpoint is None)
 
     def _log_pace(self, stage: Stage, total: int, pacer: Pacer) -> None:
-        """What the budget makes of a stage, once its pacer is known."""
+        """Log how many iterations the budget allows, once the pacer knows how long one takes."""
         factor = total / stage.iterations
         text = f"{stage.name} gets {pacer.left:.0f} s more, about {total} of {stage.iterations} iterations"
         if stage.name == "appearance":
@@ -139,11 +187,14 @@ class Loop:
         log.info("budget %s: %s", duration(self.budget.seconds), text)
 
     def _background(self, iteration: int) -> Tensor:
-        """A corner of the colour cube, the strongest contrasts, by the iteration alone: a resumed run sees the same."""
+        """Draw a corner of the colour cube, the strongest contrasts; a resumed fit draws the same ones."""
         corner = np.random.default_rng((self.seed, iteration)).integers(0, 2, 3).astype(np.float32)
         return torch.from_numpy(corner).to(self.background.device)
 
-    def _save(self, stage: Stage, iteration: int, state: Callable[[], dict[str, Any]]) -> None:
+    def _save(self, stage: Stage, iteration: int) -> None:
+        """Write a checkpoint, if the fit writes files."""
+        if self.run is None:
+            return
         summary = self.summary.state()
         checkpoint = {
             "stage": stage.name,
@@ -153,11 +204,13 @@ class Loop:
             "budget": self.budget.seconds if self.budget is not None else None,
             "used": self.budget.used if self.budget is not None else summary["seconds"],
             "summary": summary,
+            **self.finished,
+            stage.name: stage.state_dict(),
         }
-        checkpoint |= state()
         with atomic_write(self.run.checkpoint) as file:
             torch.save(checkpoint, file)
 
 
-def finished(stage: Stage) -> bool:
+def is_finished(stage: Stage) -> bool:
+    """Return True if a stage's schedule is over."""
     return stage.iterations - stage.position <= _CLOSE

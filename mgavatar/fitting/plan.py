@@ -1,4 +1,4 @@
-"""What of the method a capture needs: every ``auto`` of the configuration settled, each with its reason.
+"""The plan: every ``auto`` of a configuration decided by what the capture shows, each with its reason.
 
 The rules are explained in ``docs/presets-and-budgets.md``. A value that the user gave is never touched.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mgavatar.capture.subject import Subject
-from mgavatar.config import FitConfig
+from mgavatar.config import FitConfig, ResolvedConfig, resolve
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import pad_or_truncate
 
@@ -50,7 +50,7 @@ MAP_SIZES = (64, 128, 256)
 
 @dataclass(frozen=True)
 class Decision:
-    """One settled key.
+    """One key that was ``auto``.
 
     Attributes:
         key: As in the configuration, with dots.
@@ -158,11 +158,11 @@ class CaptureCoverage:
         return Rotation.from_rotvec(p.rotation[steps]).apply(out) + root + p.translation[steps]
 
 
-def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[FitConfig, tuple[Decision, ...]]:
-    """Settle every ``auto`` for a capture.
+def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[ResolvedConfig, tuple[Decision, ...]]:
+    """Decide every ``auto`` for a capture.
 
     Args:
-        config: As the user gave it.
+        config: The user's request.
         head: Head model that the capture was tracked with.
         subject: The capture; no image is read.
 
@@ -170,17 +170,20 @@ def plan(config: FitConfig, head: HeadModel, subject: Subject) -> tuple[FitConfi
         The configuration without any ``auto``, and the decisions that change what the fit does.
     """
     coverage = CaptureCoverage(head, subject, config.appearance.max_image_size)
+    decided: dict[str, Any] = {}
     decisions = []
     for key, rule in RULES.items():
         if _value(config, key) != "auto":
             continue
         value, reason = rule(config, coverage)
+        # Later rules see earlier decisions: the number of hash levels depends on the finest resolution.
         config = _with(config, key, value)
+        decided[key] = value
         if _matters(config, key):
             decisions.append(Decision(key, value, reason))
     if any(decision.key == "appearance.colors" and decision.value == "sh" for decision in decisions):
-        config = _with(config, "appearance.sh.degree", 0)
-    return config, tuple(decisions)
+        decided["appearance.sh.degree"] = 0
+    return resolve(config, decided), tuple(decisions)
 
 
 def _subdivisions(config: FitConfig, coverage: CaptureCoverage) -> tuple[int, str]:
@@ -268,7 +271,7 @@ RULES: dict[str, Callable[[FitConfig, CaptureCoverage], tuple[Any, str]]] = {
     "appearance.offset_net.enabled": _offset_net,
     "appearance.offset_net.resolution": _map_size,
 }
-"""Every key that may be ``auto``, in the order in which they are settled."""
+"""Every key that may be ``auto``, in the order in which they are decided."""
 
 
 def _matters(config: FitConfig, key: str) -> bool:

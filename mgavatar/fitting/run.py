@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from mgavatar.config import FitConfig, to_toml
+from mgavatar.avatar import Avatar
+from mgavatar.config import ResolvedConfig
 from mgavatar.errors import DataError
 from mgavatar.files import existing_file
-from mgavatar.fitting.budget import Budget
+from mgavatar.fitting.budget import Budget, duration
+from mgavatar.fitting.plan import Decision
 from mgavatar.fitting.stage import Stage
+from mgavatar.fitting.summary import Summary
+from mgavatar.presets import to_toml
+
+log = logging.getLogger("mgavatar")
 
 
 @dataclass(frozen=True)
@@ -58,9 +67,18 @@ def open_run(out: Path, *, resume: bool) -> Run:
 
 
 def open_checkpoint(
-    run: Run, config: FitConfig, seed: int, budget: Budget | None, *, resume: bool
+    run: Run | None, config: ResolvedConfig, seed: int, budget: Budget | None, *, resume: bool
 ) -> tuple[dict[str, Any] | None, Budget | None]:
-    """The checkpoint to go on from, if any, and what it has left of the budget; a new run's folder otherwise."""
+    """Make a new run's folder, or read the checkpoint to continue from.
+
+    Returns:
+        The checkpoint, None for a new run, and the budget with what was spent of it before.
+
+    Raises:
+        DataError: If the folder cannot be made, or the checkpoint is missing, damaged or of another fit.
+    """
+    if run is None:
+        return None, budget
     if not resume:
         run.folder.mkdir(parents=True, exist_ok=True)
         (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
@@ -73,12 +91,53 @@ def open_checkpoint(
     return checkpoint, budget
 
 
+def close_run(
+    run: Run | None,
+    avatar: Avatar,
+    summary: Summary,
+    decisions: Sequence[Decision],
+    *,
+    budget: Budget | None,
+    seed: int,
+) -> None:
+    """Write the avatar and ``summary.json`` of a finished fit, and log what became of its budget."""
+    if budget is not None:
+        log.info("budget %s: used %.0f s: %s", duration(budget.seconds), budget.used, summary.describe())
+    if run is None:
+        return
+    avatar.save(run.avatar)
+    parts = [avatar.vertex_gaussians] + ([avatar.appearance] if avatar.appearance is not None else [])
+    summary.write(
+        run.folder / "summary.json",
+        gaussians=avatar.n_gaussians,
+        parameters=sum(parameter.numel() for part in parts for parameter in part.parameters()),
+        budget_seconds=budget.seconds if budget is not None else None,
+        plan=[dataclasses.asdict(decision) for decision in decisions],
+        seed=seed,
+        device=str(avatar.device),
+    )
+
+
+def discard_run(run: Run | None) -> None:
+    """Remove the files of a fit that made no iteration worth keeping, so that its place is free for another one."""
+    if run is not None:
+        for path in (run.folder / "config.toml", run.metrics, run.checkpoint):
+            path.unlink(missing_ok=True)
+
+
 def iterations_done(checkpoint: dict[str, Any] | None, stage: Stage) -> int:
-    """Iterations that a checkpoint holds of a stage that is not finished."""
+    """Return the number of iterations that a checkpoint holds of a stage that is not finished."""
     return int(checkpoint["iteration"]) if checkpoint is not None and checkpoint["stage"] == stage.name else 0
 
 
-def restore(stage: Stage, checkpoint: dict[str, Any], run: Run) -> None:
+def restore(stage: Stage, checkpoint: dict[str, Any] | None, run: Run | None) -> None:
+    """Load a stage's state from a checkpoint, if there is one that has come as far as this stage.
+
+    Raises:
+        DataError: If the state does not fit the stage.
+    """
+    if checkpoint is None or run is None or (stage.name not in checkpoint and checkpoint["stage"] == "geometry"):
+        return
     try:
         stage.load_state_dict(checkpoint[stage.name])
     except (RuntimeError, ValueError, KeyError, TypeError) as error:
@@ -88,7 +147,7 @@ def restore(stage: Stage, checkpoint: dict[str, Any], run: Run) -> None:
         ) from error
 
 
-def _read_checkpoint(run: Run, config: FitConfig, seed: int) -> dict[str, Any]:
+def _read_checkpoint(run: Run, config: ResolvedConfig, seed: int) -> dict[str, Any]:
     path = existing_file(run.checkpoint)
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import GeometryConfig
+from mgavatar.config import ResolvedGeometryConfig
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
 from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
@@ -34,7 +34,7 @@ class PosedHead:
 class PersonalHead(nn.Module):
     """Learnable identity beta, offset networks, and theta, psi and translation of every timestep."""
 
-    def __init__(self, body: Body, params: HeadParams, config: GeometryConfig) -> None:
+    def __init__(self, body: Body, params: HeadParams, config: ResolvedGeometryConfig) -> None:
         super().__init__()
         self.body = body
         device = body.device
@@ -72,8 +72,8 @@ class PersonalHead(nn.Module):
     def learn_poses(self) -> None:
         """Let the parameters of all timesteps learn; jaw and eyes where ``learn_jaw`` and ``learn_eyes`` say so."""
         self.poses.requires_grad_(True)
-        self.poses["jaw_pose"].requires_grad_(bool(self.config.learn_jaw))
-        self.poses["eyes_pose"].requires_grad_(bool(self.config.learn_eyes))
+        self.poses["jaw_pose"].requires_grad_(self.config.learn_jaw)
+        self.poses["eyes_pose"].requires_grad_(self.config.learn_eyes)
 
     def pose(self, timestep: int) -> Pose:
         """Parameters of a timestep of the capture, as refined so far."""

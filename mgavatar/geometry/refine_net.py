@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from mgavatar.config import GeometryConfig
+from mgavatar.config import ResolvedGeometryConfig
 from mgavatar.kernels.mlp import linear_layers, mlp
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import uv_sampler
@@ -31,7 +31,7 @@ class RefineNet(nn.Module):
     Vertices keep their place in the triplane, so sampling it is a fixed matrix.
     """
 
-    def __init__(self, v_template: Tensor, config: GeometryConfig) -> None:
+    def __init__(self, v_template: Tensor, config: ResolvedGeometryConfig) -> None:
         """Encode the vertices of the fine template, shape [V, 3]."""
         super().__init__()
         resolution, channels = config.triplane_resolution, config.triplane_channels

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mgavatar.camera import Camera
-from mgavatar.config import FitConfig, ImageLossConfig
+from mgavatar.config import ImageLossConfig, ResolvedConfig
 from mgavatar.geometry.head import PosedHead
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.kernels.laplacian import laplacian
@@ -33,7 +33,7 @@ class GeometryStage:
 
     name = "geometry"
 
-    def __init__(self, gaussians: VertexGaussians, config: FitConfig) -> None:
+    def __init__(self, gaussians: VertexGaussians, config: ResolvedConfig) -> None:
         self.gaussians = gaussians
         self.config = config
         self.iterations = config.geometry.iterations

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from mgavatar.camera import Camera
-from mgavatar.config import FitConfig
+from mgavatar.config import ResolvedConfig
 from mgavatar.gaussians import SH_C0, Gaussians, draw
 from mgavatar.geometry.head import PersonalHead, PosedHead
 from mgavatar.kernels.rasterize import RasterSettings, Rendering
@@ -16,7 +16,7 @@ from mgavatar.kernels.rasterize import RasterSettings, Rendering
 class VertexGaussians(nn.Module):
     """One Gaussian a vertex with reduced freedom: no rotation, one scale, opacity 1, SH degree 0 colour."""
 
-    def __init__(self, head: PersonalHead, config: FitConfig) -> None:
+    def __init__(self, head: PersonalHead, config: ResolvedConfig) -> None:
         super().__init__()
         self.head = head
         self.config = config

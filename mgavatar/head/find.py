@@ -11,7 +11,7 @@ import numpy as np
 
 from mgavatar.errors import DataError
 from mgavatar.files import path_inside, read_json
-from mgavatar.head.load import load_head_model
+from mgavatar.head.load import read_head_model
 from mgavatar.head.model import HeadModel
 from mgavatar.head.procedural.build import build_head
 
@@ -35,6 +35,18 @@ OTHER_PICKLES = ("mask", "embedding", "landmark", "texture")
 log = logging.getLogger("mgavatar")
 
 
+def load_head_model(name: Path | str) -> HeadModel:
+    """Return a head model by the path of its file, or the built-in one.
+
+    Args:
+        name: ``.npz`` with FLAME's keys, FLAME ``.pkl``, or ``"builtin"``.
+
+    Raises:
+        DataError: If the file is missing, damaged or inconsistent.
+    """
+    return build_head() if str(name) == BUILTIN else read_head_model(Path(name).expanduser())
+
+
 def resolve_head_model(text: str | None, root: Path) -> HeadModel:
     """Return the head model that the user names, or else the one that belongs to the capture.
 
@@ -52,7 +64,7 @@ def resolve_head_model(text: str | None, root: Path) -> HeadModel:
     """
     if text is None:
         return find_head_model(root)
-    head = _load(text)
+    head = load_head_model(text)
     _warn_of_another_head(head, root)
     return head
 
@@ -85,20 +97,16 @@ def find_head_model(root: Path) -> HeadModel:
         names = " and ".join(path.name for path in beside)
         raise DataError(f"{root}: {names} are head models; give --head-model with the one that it was tracked with")
     if beside:
-        return load_head_model(beside[0])
+        return read_head_model(beside[0])
     if text := os.environ.get(ENVIRONMENT_VARIABLE):
         try:
-            return _load(text)
+            return load_head_model(text)
         except DataError as error:
             raise DataError(f"{ENVIRONMENT_VARIABLE}: {error}") from error
     raise DataError(
         f"{root}: does not name its head model; give --head-model FILE (the FLAME .pkl or head .npz that it was "
         f"tracked with), set {ENVIRONMENT_VARIABLE}, or --head-model {BUILTIN} for the built-in head"
     )
-
-
-def _load(text: str) -> HeadModel:
-    return build_head() if text == BUILTIN else load_head_model(Path(text).expanduser())
 
 
 def _named_head(root: Path) -> HeadModel | None:
@@ -113,7 +121,7 @@ def _named_head(root: Path) -> HeadModel | None:
     if name == BUILTIN:
         return build_head()
     folder = root.resolve()
-    return load_head_model(path_inside(name, base=folder, allowed=folder, where=f"{path}: {HEAD_MODEL_KEY}"))
+    return read_head_model(path_inside(name, base=folder, allowed=folder, where=f"{path}: {HEAD_MODEL_KEY}"))
 
 
 def _heads_beside(root: Path) -> list[Path]:

@@ -21,7 +21,7 @@ FLAME_N_SHAPE = 300
 MAX_ARRAYS = 2 * GIBIBYTE
 
 
-def load_head_model(path: Path) -> HeadModel:
+def read_head_model(path: Path) -> HeadModel:
     """Read and check a head model.
 
     A ``.npz`` holds everything itself. A FLAME pickle (2020, 2023, 2023_no_jaw, 2023_Open) has no texture coordinates:
@@ -68,7 +68,7 @@ def head_arrays(model: HeadModel) -> dict[str, np.ndarray]:
 
 
 def save_head_model(path: Path, model: HeadModel) -> None:
-    """Write a head model as the ``.npz`` file that :func:`load_head_model` reads.
+    """Write a head model as the ``.npz`` file that :func:`read_head_model` reads.
 
     Raises:
         DataError: If the file cannot be written.

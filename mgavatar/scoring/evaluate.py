@@ -38,8 +38,8 @@ def evaluate(
     avatar: Avatar,
     subject: Subject,
     *,
-    avatar_path: Path,
-    splits: Sequence[Split],
+    splits: Sequence[Split] = ("val", "test"),
+    avatar_path: Path | None = None,
     lpips_weights: Path | None = None,
     max_frames: int | None = None,
     bad_truth: Literal["refuse", "warn"] = "refuse",
@@ -53,8 +53,8 @@ def evaluate(
     Args:
         avatar: The avatar.
         subject: The capture; images of ``val`` and ``test`` that are in ``train`` too are left out with a warning.
-        avatar_path: File of the avatar, for the record.
         splits: Splits to score.
+        avatar_path: File of the avatar, for the record.
         lpips_weights: The state dict of ``lpips.LPIPS(net="vgg")``, or None.
         max_frames: Score at most so many images per split, spread over it; ``sampled_from`` then states their number.
         bad_truth: Refuse ground truth that cannot be scored, or warn and leave the geometry out.
@@ -97,7 +97,7 @@ def evaluate(
     if truth is not None:
         geometry, geometry_reason = _score_truth(avatar, subject, truth)
     return {
-        "avatar": str(avatar_path),
+        "avatar": str(avatar_path) if avatar_path is not None else None,
         "data": str(subject.root),
         "device": str(avatar.device),
         "splits": results,
@@ -107,7 +107,9 @@ def evaluate(
     }
 
 
-def evaluate_sample(avatar: Avatar, subject: Subject, *, avatar_path: Path, max_frames: int = 24) -> dict[str, Any]:
+def evaluate_sample(
+    avatar: Avatar, subject: Subject, *, avatar_path: Path | None, max_frames: int | None = 24
+) -> dict[str, Any]:
     """Score a fit that has just ended on some held-out images, or on training images if none are held out.
 
     Ground truth that cannot be scored costs the score of the geometry and a warning, not the whole score.

@@ -22,6 +22,8 @@ from mgavatar.config import (
     FitConfig,
     GeometryConfig,
     OffsetNetConfig,
+    ResolvedConfig,
+    resolve,
 )
 from mgavatar.fitting.stage import Stage
 from mgavatar.fitting.views import Views
@@ -66,6 +68,11 @@ def tiny_config(*, geometry: dict[str, Any] | None = None, appearance: dict[str,
         geometry=GeometryConfig(**g | (geometry or {})),
         appearance=AppearanceConfig(**a | (appearance or {})),
     )
+
+
+def tiny_resolved(**sections: Any) -> ResolvedConfig:
+    """The same with every ``auto`` decided, for what is built without a plan."""
+    return resolve(tiny_config(**sections), {"geometry.subdivisions": 1})
 
 
 def write_tiny_capture(root: Path, *, n_timesteps: int = 4) -> Path:

@@ -12,7 +12,7 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Subject
-from mgavatar.config import FitConfig, GeometryConfig
+from mgavatar.config import FitConfig, GeometryConfig, resolve
 from mgavatar.gaussians import SH_C0
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
@@ -32,7 +32,7 @@ def avatar_on(subject: Subject, model: HeadModel) -> Avatar:
     """An avatar at the start of its fit."""
     torch.manual_seed(0)
     geometry = GeometryConfig(subdivisions=0, hidden=8, triplane_resolution=8, triplane_channels=2)
-    config = FitConfig(geometry=geometry)
+    config = resolve(FitConfig(geometry=geometry))
     gaussians = VertexGaussians(PersonalHead(Body(model, subdivisions=0), subject.params, geometry), config)
     with torch.no_grad():
         gaussians.log_scales.fill_(-3.5)

@@ -6,18 +6,16 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
-from mgavatar.capture.transforms import FrameReader, PrincipalPoint, camera_of_frame
+from mgavatar.capture.transforms import FrameReader, camera_of_frame
+from mgavatar.config import Background, PrincipalPoint
 from mgavatar.errors import DataError
 from mgavatar.files import float_array, one_line, read_json, read_npz
 from mgavatar.head.params import POSE_WIDTHS, HeadParams
-
-Background = Literal["white", "black"]
 
 BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
