@@ -11,8 +11,9 @@ import results_table as tool
 from markdown_cells import cells_of
 from trade_raster import fraction
 
-from mgavatar.config import ACCURACY, read_preset
+from mgavatar.config import ACCURACY
 from mgavatar.errors import DataError
+from mgavatar.presets import preset_table
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = json.loads(tool.RESULTS.read_text("utf-8"))
@@ -78,7 +79,7 @@ def test_readme_rows():
 def test_results_are_of_presets_and_levels_that_exist():
     """What is renamed in the program must be renamed in the results."""
     for row in RESULTS["fits"]["rows"]:
-        read_preset(row["preset"])
+        preset_table(row["preset"])
         assert row["capture"] in RESULTS["captures"]
     levels = {row["level"]: (row["alpha_threshold"], row["stop"]) for row in RESULTS["accuracy"]["rows"]}
     assert levels == {name: tuple(fraction(value) for value in values) for name, values in ACCURACY.items()}
