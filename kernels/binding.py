@@ -1,6 +1,6 @@
-"""Gaussians bound to faces, to the world in one pass: offsets, activations and Eq. 8, with a hand-written adjoint.
+"""Face-bound Gaussians carried to the world in one pass: offsets, activations and Eq. 8, with a hand-written adjoint.
 
-What a dozen of torch's operations compute, but every number is read and written once.
+A dozen torch operations would compute the same, but here every number is read and written once.
 """
 
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.func
     def place(q: vec4, k: scalar, center: vec3, local: vec3) -> vec3:
-        """The centre of Eq. 8."""
+        """Compute the centre of Eq. 8, ``k R mu + T``."""
         return k * rotate(q, local) + center
 
     @wp.kernel(module=module, enable_backward=False)
@@ -92,7 +92,7 @@ def _kernels(real: Real) -> SimpleNamespace:
         v_log_scales: wp.array[vec3],  # [N]
         v_logits: wp.array[scalar],  # [N]
         v_offsets: wp.array[scalar],  # [13 N] or empty
-        v_frames: wp.array2d[scalar],  # [N, 8] share of each Gaussian: quaternion, scale, centre; or empty
+        v_frames: wp.array2d[scalar],  # [N, 8] each Gaussian's share: quaternion, scale, centre; or empty
     ) -> None:
         n = first + wp.tid()
         f = face_ids[n]
@@ -123,6 +123,8 @@ def _kernels(real: Real) -> SimpleNamespace:
                 v_offsets[i + 9 + c] = v_scale[c]
             v_offsets[i + 12] = v_logit
         if v_frames.shape[0] > 0:
+            # The mean is k (p + 2 w (a x p) + 2 a x (a x p)) + T for the face's quaternion (w, a): v_w and v_a are
+            # its derivatives times g, and v_face adds the path through the Gaussian's own quaternion.
             g = v_means[n]
             p = local_means[n] + move
             a = vec3(q[1], q[2], q[3])
@@ -180,7 +182,7 @@ class _Bind(torch.autograd.Function):
     def forward(ctx: Any, order: SparseMatrix | None, face_ids: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         face_quats, face_scales, face_centers, means, quats, log_scales, logits, offsets = tensors
         n = len(face_ids)
-        # Exponentials are left to torch, whose are vectors.
+        # Torch computes the exponentials: its loops are vectorised, those of Warp's scalar code are not.
         more = offsets.split([9, 3, 1], dim=1) if len(offsets) else None
         scales = torch.exp(log_scales + more[1] if more else log_scales)
         opacities = torch.sigmoid(logits + more[2][:, 0] if more else logits)
@@ -239,7 +241,7 @@ def bind_to_faces(
     offset's rotation vector r multiplies the local rotation from the right as the quaternion (1, r / 2).
 
     Args:
-        frames: Of all faces: unit quaternions wxyz [F, 4], scales k [m] [F] and centres [m] [F, 3], float32 or float64.
+        frames: Unit quaternions wxyz [F, 4], scales k [m] [F] and centres [m] [F, 3] of all faces, float32 or float64.
         face_ids: Face of each Gaussian, shape [N], int64.
         local_means: Centres in units of k, shape [N, 3].
         local_quats: Rotations wxyz in the face's frame, shape [N, 4]; their length is carried through.
@@ -274,12 +276,12 @@ def bind_to_faces(
 
 
 def place_on_faces(frames: tuple[Tensor, Tensor, Tensor], face_ids: Tensor, local_means: Tensor) -> Tensor:
-    """Centres alone: ``k R mu + T`` (Eq. 8). No gradient.
+    """Carry centres alone from their faces to the world: ``k R mu + T`` (Eq. 8). No gradient.
 
     Args:
         frames: As in :func:`bind_to_faces`.
         face_ids: Shape [N], int64.
-        local_means: In units of k, shape [N, 3].
+        local_means: Centres in units of k, shape [N, 3].
 
     Returns:
         Centres [m], shape [N, 3].
@@ -294,14 +296,17 @@ def place_on_faces(frames: tuple[Tensor, Tensor, Tensor], face_ids: Tensor, loca
 def directions_on_faces(
     means: Tensor, position: Tensor, face_ids: Tensor, from_quats: Tensor, to_quats: Tensor
 ) -> Tensor:
-    """Directions from a point to Gaussians, carried from one frame of their faces to another. No gradient.
+    """Compute directions from a point to Gaussians, and turn them with the Gaussians' faces. No gradient.
+
+    A view direction in the posed mesh becomes one in the canonical mesh: out of the face's frame in the one, into its
+    frame in the other.
 
     Args:
         means: Centres [m], shape [N, 3].
         position: The point [m], shape [3].
         face_ids: Shape [N], int64.
-        from_quats: Frames in which means and position are, unit quaternions wxyz, shape [F, 4].
-        to_quats: Frames to carry the directions to, shape [F, 4].
+        from_quats: Face frames of the mesh that ``means`` and ``position`` belong to, unit quaternions wxyz, [F, 4].
+        to_quats: Face frames of the mesh to turn the directions to, shape [F, 4].
 
     Returns:
         Unit directions, shape [N, 3].

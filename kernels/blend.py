@@ -1,6 +1,6 @@
-"""Kernels of the blend shapes: both directions read every number of the directions once, and little else.
+"""Kernels of the blend shapes. Forward and backward read every number of the directions once, and little else.
 
-At 5K vertices and 400 directions that is 24 MB a pass, so the time is that of the memory.
+At 5K vertices and 400 directions that is 24 MB per pass: memory bandwidth sets the time.
 """
 
 from types import SimpleNamespace
@@ -14,12 +14,12 @@ from torch.autograd.function import once_differentiable
 from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype
 
-_BLOCK = 16384  # numbers that one CPU item adds up: they stay in its cache, and directions are read in long pieces
-_DIRECTIONS = 8  # that one CPU item multiplies with the gradient
+_BLOCK = 16384  # numbers per CPU item: sums stay in its cache, and directions are read in long pieces
+_DIRECTIONS = 8  # directions per CPU item in the backward pass
 _LANES = 64  # partial sums of a dot product, the same on a CPU (vector lanes) and on CUDA (threads)
 
-# Four directions a pass: a sum is loaded and stored once for four products. Directions whose coefficient is exactly
-# zero are not read.
+# Four directions per pass: each sum is loaded and stored once for four products. Directions whose coefficient is
+# exactly zero are not read, so they are gathered into groups of four first.
 _BLEND_SNIPPET = """
     const long long n = out.shape[0];
     const int n_dirs = coeffs.shape[0];
@@ -66,7 +66,7 @@ _DOT_SNIPPET = """
         return;
     }
 #if !defined(__CUDACC__)
-    // An item owns a few whole directions, and a piece of the gradient serves them all while it is in the cache.
+    // An item owns a few whole directions; each piece of the gradient serves all of them while it is in the cache.
     enum { PART = LANES / 4, PIECE = 4096 };
     typedef REAL part __attribute__((ext_vector_type(PART), aligned(sizeof(REAL))));
     const int count = partial.shape[0] - k < width / LANES ? partial.shape[0] - k : width / LANES;
@@ -80,7 +80,8 @@ _DOT_SNIPPET = """
             part* s = (part*)(sums + m * LANES);
             part s0 = s[0], s1 = s[1], s2 = s[2], s3 = s[3];
             for (long long i = from; i < to; i += LANES) {
-                // The hardware starts anew at every page of every direction; asking ahead is 1.3 to 1.8 times faster.
+                // The hardware's prefetcher starts anew at each page of each direction: asking ahead by hand is 1.3 to
+                // 1.8 times faster.
                 for (int ahead = 0; ahead < LANES; ahead += PART)
                     __builtin_prefetch(e + i + 1024 + ahead);
                 s0 += *(const part*)(e + i) * *(const part*)(g + i);
@@ -132,7 +133,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     def blend_kernel(
         # In:
         first: int,
-        width: int,  # numbers an item owns
+        width: int,  # numbers per item
         dirs: wp.array2d[scalar],  # [K, 3V]
         coeffs: wp.array[scalar],  # [K]
         start: wp.array[scalar],  # [3V]
@@ -145,7 +146,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     def blend_bwd_kernel(
         # In:
         first: int,
-        width: int,  # lanes an item owns: 1, or all those of a few directions
+        width: int,  # lanes per item: 1, or those of a few directions
         dirs: wp.array2d[scalar],  # [K, 3V]
         grad: wp.array[scalar],  # [3V]
         # Out:
@@ -174,10 +175,11 @@ _KERNELS = by_dtype(_kernels)
 
 
 class BlendShapes(torch.autograd.Function):
-    """``start + sum_k coeffs[k] dirs[k]`` as a node of torch's graph; ``lbs.blend_shapes`` checks."""
+    """A node of torch's graph: ``start + sum_k coeffs[k] dirs[k]``. ``lbs.blend_shapes`` checks its inputs."""
 
     @staticmethod
     def forward(ctx: Any, start: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
+        """Add the directions [K, V, 3] to ``start`` [V, 3], each times its coefficient [K]."""
         ctx.save_for_backward(dirs)
         out = torch.empty_like(start, memory_format=torch.contiguous_format)
         width = 1 if start.is_cuda else _BLOCK
@@ -190,6 +192,7 @@ class BlendShapes(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
+        """Return the gradients of ``start`` and ``coeffs`` from that of the output [V, 3]."""
         (dirs,) = ctx.saved_tensors
         if not ctx.needs_input_grad[2]:
             return grad, None, None

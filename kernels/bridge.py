@@ -35,7 +35,7 @@ def set_num_threads(n: int) -> None:
 
 
 def num_threads() -> int:
-    """Threads that :func:`launch_ranges` uses on a CPU."""
+    """Return the number of threads that :func:`launch_ranges` uses on a CPU."""
     return _n_threads
 
 
@@ -45,13 +45,14 @@ def _pool(n: int) -> ThreadPoolExecutor:
 
 
 def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+    """Make Warp launch on torch's current stream inside; nothing to do on a CPU."""
     if device.type != "cuda":
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))
 
 
 def to_warp(tensor: Tensor, dtype: Any, *, requires_grad: bool = False) -> wp.array:
-    """View ``tensor`` as a Warp array of ``dtype`` without a copy; a gradient buffer, if any, is Warp's own."""
+    """Wrap ``tensor`` as a Warp array of ``dtype`` without a copy; a gradient buffer, if any, is Warp's own."""
     return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=requires_grad)
 
 
@@ -94,8 +95,8 @@ def launch_ranges(
     """Run ``kernel`` over ``n_items`` independent items; on a CPU, several threads take disjoint ranges of them.
 
     The kernel's first argument is the index of its range's first item. Items must write disjoint memory: the result
-    is then the same, bit for bit, for any number of threads. Eight ranges a thread balance uneven items; handing out a
-    range costs some 0.07 ms, so items that cost the same take one.
+    is then the same, bit for bit, for any number of threads. Eight ranges per thread balance items of uneven cost. A
+    range costs some 0.07 ms to hand out, so kernels whose items all cost the same take one per thread.
     """
     device = _device([*outputs, *inputs])
     arguments = _arguments(kernel, [*inputs, *outputs], first=1)
@@ -172,12 +173,12 @@ def taped(kernel: wp.Kernel, dim: int, inputs: Sequence[Any], shapes: Sequence[S
 
 
 def sort_pairs(keys: Tensor, values: Tensor, *, bits: int = 32) -> tuple[Tensor, Tensor]:
-    """Stable radix sort of ``keys`` [N] (float32 or int32) carrying ``values`` [N] (int32).
+    """Sort ``keys`` and carry ``values`` along: a stable radix sort.
 
     Args:
-        keys: Sort keys, shape [N].
+        keys: Sort keys, shape [N], float32 or int32.
         values: Carried along, shape [N], int32.
-        bits: Number of low bits of the keys that can differ.
+        bits: Number of low bits in which the keys may differ.
 
     Returns:
         Both in ascending order of the keys, ties in their given order.

@@ -31,19 +31,20 @@ def _closest_point_kernel(
 
 
 def closest_points(verts: Tensor, faces: Tensor, points: Tensor, *, reach: float = 1.0) -> tuple[Tensor, Tensor]:
-    """The point of a mesh that is nearest to each query.
+    """Find the point of a mesh nearest to each query.
 
     Args:
         verts: Vertices [m], shape [V, 3], float32.
         faces: Vertex indices, shape [F, 3], int32.
         points: Queries [m], shape [N, 3], float32.
-        reach: Nothing further than this is found [m].
+        reach: Largest distance searched [m].
 
     Returns:
-        Nearest points [m], shape [N, 3], and the faces that they lie on, -1 where there is none, shape [N], int32.
+        Nearest points [m], shape [N, 3], the query itself where nothing is in reach; and the faces that they lie on, -1
+        where nothing is, shape [N], int32.
 
     Raises:
-        ValueError: If a face names a vertex that is not there.
+        ValueError: If a face has an index outside the vertices.
     """
     if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(verts):
         raise ValueError(f"faces name vertices {int(faces.min())}..{int(faces.max())} of {len(verts)}")

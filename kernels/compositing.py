@@ -1,13 +1,13 @@
-"""Alpha compositing, one thread a pixel, with its hand-written adjoint: the readable reference, and the CUDA form.
+"""Alpha compositing, one thread per pixel, with its hand-written adjoint: the readable reference, and the CUDA form.
 
-Front to back, with ``alpha = min(cap, opacity G)`` and ``T`` the light that is left,
+Front to back, with ``alpha = min(cap, opacity G)`` and the transmittance ``T``,
 
     image = sum_k T_k alpha_k c_k + T_end background,    T_{k+1} = T_k (1 - alpha_k).
 
 A Gaussian with ``alpha < threshold`` is skipped; a pixel ends *after* the Gaussian that takes ``T`` below ``stop``. The
-adjoint walks back from the last Gaussian that a pixel accepted, from the *stored* ``T``, which keeps its relative
-precision however small it is. ``behind`` is what a pixel sees past Gaussian k, weighted by the image's gradient; it
-replaces the colour buffers and is a convex combination, so it cannot blow up.
+adjoint walks back from the last Gaussian that the pixel blended and from the *stored* ``T``, which keeps its relative
+precision however small it is. ``behind`` is the colour behind Gaussian k times the image's gradient, one number per
+pixel instead of a colour buffer. It is a convex combination of what was blended, so it cannot blow up.
 
 Warp does not replay loops like these, so autodiff is off in this file.
 """
@@ -19,7 +19,7 @@ import warp as wp
 
 TILE = 16
 BLOCK = TILE * TILE
-"""Threads of a tile: also what Warp puts into a CUDA block by default, which the block sums below rely on."""
+"""Threads per tile. Warp's default CUDA block has as many, and the block sums below rely on it."""
 
 _BLOCK_SUM = """
 #if defined(__CUDA_ARCH__)
@@ -59,7 +59,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func
     def offset(splats: wp.array2d[real], n: int, x: int, y: int) -> vec2:
-        """u and dy of a pixel's centre (projection.py, row form)."""
+        """Return u and dy of a pixel's centre (row form, see projection.py)."""
         dy = (real(y) - splats[n, 1]) - splats[n, 3]
         return vec2((real(x) - splats[n, 0]) - splats[n, 2] - splats[n, 5] * dy, dy)
 
@@ -109,7 +109,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
                     green += weight * splats[n, 9]
                     blue += weight * splats[n, 10]
                     depth += weight * splats[n, 11]
-                    T = T * (real(1.0) - alpha)  # T - weight would lose it to rounding when alpha is near 1
+                    T = T * (real(1.0) - alpha)  # T - weight would cancel where alpha is near 1
                     accepted = k
         image[b, 0, y, x] = red + T * background[b, 0]
         image[b, 1, y, x] = green + T * background[b, 1]
@@ -159,7 +159,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
                 v_red * background[b, 0] + v_green * background[b, 1] + v_blue * background[b, 2] - v_alphas[b, y, x]
             )
             accepted = last_ids[b, y, x]
-        # Every thread of the block walks the same entries: the block sums need all of them.
+        # All threads of the block walk all entries of the tile: the block sums need every one of them.
         for step in range(tile_end[tile] - tile_begin[tile]):
             k = tile_end[tile] - 1 - step
             n = gaussian_ids[isect_ids[k]]

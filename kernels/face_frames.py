@@ -29,7 +29,7 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.func
     def any_normal(direction: vec3) -> vec3:
-        """A unit vector at right angles to a unit ``direction``."""
+        """Return a unit vector at right angles to a unit ``direction``."""
         helper = vec3(one, zero, zero)
         if wp.abs(direction[0]) > half:
             helper = vec3(zero, one, zero)
@@ -37,7 +37,10 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.func
     def quat_of_axes(x: vec3, y: vec3, z: vec3) -> vec4:
-        """Quaternion wxyz of the rotation with these columns, of which no component is divided by a small number."""
+        """Return the quaternion wxyz of the rotation with these columns.
+
+        Each branch starts from a component that is not small, so that nothing is divided by a small number.
+        """
         trace = x[0] + y[1] + z[2]
         q = vec4(one + trace, y[2] - z[1], z[0] - x[2], x[1] - y[0])
         if trace < zero:
@@ -58,7 +61,7 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.func
     def quat_product(p: vec4, q: vec4) -> vec4:
-        """Hamilton product of quaternions wxyz."""
+        """Multiply quaternions wxyz (Hamilton product)."""
         return vec4(
             p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
             p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -120,7 +123,7 @@ def gather_matrix(index: Tensor, n_rows: int) -> SparseMatrix:
 
 
 def gather_rows(x: Tensor, index: Tensor, *, order: SparseMatrix | None = None) -> Tensor:
-    """Take rows of ``x``; the adjoint adds up gradients in a fixed order. Differentiable in ``x``.
+    """Take rows of ``x``. Differentiable in ``x``; the adjoint adds up gradients in a fixed order.
 
     Args:
         x: Values, shape [M, ...], float32 or float64.
@@ -140,10 +143,10 @@ def gather_rows(x: Tensor, index: Tensor, *, order: SparseMatrix | None = None) 
 
 
 def face_frames(verts: Tensor, faces: Tensor, *, order: SparseMatrix | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Frames of all faces, the R, k and T of Eq. 8. Differentiable in ``verts``.
+    """Compute the frames of all faces, the R, k and T of Eq. 8. Differentiable in ``verts``.
 
     A face whose height is less than 1e-5 of its longest edge has no usable normal in float32: its frame keeps the
-    edge and takes any normal; one whose edge has no length is not rotated. Neither passes a gradient through what it
+    edge and takes any normal. A face whose first edge has no length is not rotated. No gradient flows through what was
     replaced, so gradients stay finite.
 
     Args:

@@ -1,8 +1,8 @@
 """Multiresolution hash features of points in the unit cube: kernels, and the op with an ordinary gradient.
 
 L grids of growing resolution hold F numbers at each vertex; a level whose vertices fit its table is stored densely, a
-finer one shares entries through a hash of the vertex. A point reads its cell's eight vertices on each level,
-interpolates, and the levels are concatenated.
+finer one shares entries through a hash of the vertex. A point interpolates the eight vertices of its cell on each
+level; the levels are concatenated.
 """
 
 from functools import lru_cache
@@ -18,12 +18,15 @@ from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype, pick
 
 BLOCK = 64  # entries that share one mark "has a gradient"; no block spans two levels
-_POINTS = 512  # points of one CPU item in the forward
-_FIXED_BITS = 60  # of the integers that add up gradients on CUDA
+_POINTS = 512  # points per CPU item in the forward pass
+_FIXED_BITS = 60  # bits of the integers that add up gradients on CUDA
 
-# The cells and weights of TILE points on one level, as vectors on a CPU, for one point a thread on CUDA.
-# The fraction comes from a double product: in float32, p * resolution would lose it on fine levels.
-# A comparison with NaN is false, so that NaN falls on 0 and no index leaves the table.
+# Cells and weights of TILE points on one level: vectors on a CPU, one point per thread on CUDA.
+# x is a double: in float32, p * resolution keeps no digits of the fraction on fine levels.
+# `p > 0 ? ... : 0` is false for NaN, so NaN becomes 0 and no index leaves the table.
+# Corner bits: 1 for x, 2 for y, 4 for z. A dense level numbers its vertices row by row; a hashed level mixes the
+# coordinates with two large odd factors (Mueller et al. 2022) and keeps the low bits. Both are one formula with other
+# steps, chosen per level, so that the inner loop has no branch.
 _LOCATE = """
     const int resolution = levels.data[level * 3];
     const int n_entries = levels.data[level * 3 + 2];
@@ -86,7 +89,7 @@ _ENCODE = """
     }
 """
 
-# Points without a gradient, such as those of Gaussians that no pixel saw, are passed over.
+# Points without a gradient, such as those of Gaussians that no pixel saw, are skipped.
 _TABLE_BWD = """
     for (int from = begin; from < end; from += TILE) {
         const int many = end - from < TILE ? end - from : TILE;
@@ -112,7 +115,7 @@ _TABLE_BWD = """
 
 _ADD_REAL = "sums.data[value + f] += w * g[f];"
 
-# Integer addition is the same in any order. On a CPU this form runs in one thread, for the tests.
+# Sums of integers do not depend on their order. On a CPU this form runs in one thread, for the tests.
 _ADD_FIXED = """
                     const double scaled = (double)w * g[f] * scale.data[0];
                     const long long whole = (long long)(scaled + (scaled < 0.0 ? -0.5 : 0.5));
@@ -218,7 +221,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
     def encode_kernel(
         # In:
         first: int,
-        width: int,  # points an item owns on one level
+        width: int,  # points per item, on one level
         points: wp.array2d[scalar],  # [N, 3]
         table: wp.array2d[scalar],  # [T, F]
         levels: wp.array2d[int],  # [L, 3]
@@ -277,7 +280,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
     def points_bwd_kernel(
         # In:
         first: int,
-        width: int,  # points an item owns on all levels
+        width: int,  # points per item, on all levels
         points: wp.array2d[scalar],  # [N, 3]
         table: wp.array2d[scalar],  # [T, F]
         grad: wp.array2d[scalar],  # [N, L F]
@@ -302,6 +305,7 @@ def _kernels(real: Real, features: int) -> SimpleNamespace:
 
 @lru_cache
 def kernels_for(features: int) -> Any:
+    """Return the kernels of a table with ``features`` numbers per entry, by dtype."""
     return by_dtype(lambda real: _kernels(real, features))
 
 
@@ -309,7 +313,12 @@ kernels_for(2)  # made on import, so that they can be compiled ahead of time
 
 
 class TableGradient:
-    """The gradient of a table: its numbers, and a mark on each block of entries that has any."""
+    """The gradient of a table, with a mark on each block of entries that it touches.
+
+    Attributes:
+        values: Gradient, shape [T, F].
+        marks: 1 for each block of ``BLOCK`` entries that has a gradient, shape [T / BLOCK], uint8.
+    """
 
     def __init__(self, values: Tensor, marks: Tensor) -> None:
         self.values = values
@@ -318,11 +327,21 @@ class TableGradient:
 
     @classmethod
     def like(cls, table: Tensor) -> "TableGradient":
+        """Return a zero gradient of ``table`` [T, F]."""
         marks = torch.zeros(-(-len(table) // BLOCK), dtype=torch.uint8, device=table.device)
         return cls(torch.zeros_like(table), marks)
 
     def add(self, points: Tensor, grad: Tensor, levels: Tensor) -> None:
-        """Add the gradient of one forward: a level a CPU thread, point after point; integer atomics on CUDA."""
+        """Add the gradient of one forward pass.
+
+        On a CPU a thread owns a level and walks the points in order; CUDA adds integers with atomics. Both give the
+        same bits on every run.
+
+        Args:
+            points: Points of the forward pass, shape [N, 3].
+            grad: Gradient of its features, shape [N, L F].
+            levels: ``HashGridShape.table_levels``, shape [L, 3].
+        """
         if not len(points):
             return
         if self.values.is_cuda:
@@ -332,7 +351,7 @@ class TableGradient:
         launch_ranges(kernels.table_bwd, len(levels), (points, grad, levels), (self.values, self.marks))
 
     def add_fixed(self, points: Tensor, grad: Tensor, levels: Tensor) -> None:
-        """As :meth:`add`, with sums in fixed point, whose unit is the power of two that just cannot overflow."""
+        """Add as :meth:`add` does, in fixed point; its unit is the smallest power of two that cannot overflow."""
         if self._fixed is None:
             self._fixed = torch.zeros_like(self.values, dtype=torch.int64)
         kernels = kernels_for(self.values.shape[1])[self.values.dtype]
@@ -344,8 +363,11 @@ class TableGradient:
 
 
 class HashEncode(torch.autograd.Function):
+    """A node of torch's graph: points to features. :func:`check_inputs` checks what goes in."""
+
     @staticmethod
     def forward(ctx: Any, points: Tensor, table: Tensor, levels: Tensor, owned: TableGradient | None) -> Tensor:
+        """Return features [N, L F]. With ``owned``, the table's gradient goes there instead of to torch."""
         ctx.save_for_backward(points, table, levels)
         ctx.owned = owned
         out = points.new_empty(len(points), len(levels) * table.shape[1])
@@ -359,6 +381,7 @@ class HashEncode(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
+        """Return the gradients of points [N, 3] and table [T, F] from that of the features [N, L F]."""
         points, table, levels = ctx.saved_tensors
         grad_points, grad_table = None, None
         if ctx.needs_input_grad[0]:
@@ -376,12 +399,12 @@ class HashEncode(torch.autograd.Function):
 
 
 def hash_encode(points: Tensor, table: Tensor, levels: Tensor) -> Tensor:
-    """Features of points, with an ordinary gradient for the whole table; ``HashGrid`` has a cheaper one.
+    """Encode points as features, with an ordinary gradient of the whole table; ``HashGrid`` has a cheaper one.
 
     Differentiable in ``points`` and ``table``.
 
     Args:
-        points: Points, held inside the unit cube, shape [N, 3], float32 or float64.
+        points: Points, clamped to the unit cube, shape [N, 3], float32 or float64.
         table: Entries of all levels, shape [T, F].
         levels: ``HashGridShape.table_levels``, shape [L, 3], int32, on the device of ``table``.
 
@@ -396,6 +419,11 @@ def hash_encode(points: Tensor, table: Tensor, levels: Tensor) -> Tensor:
 
 
 def check_inputs(points: Tensor, table: Tensor, levels: Tensor) -> None:
+    """Refuse points and tables that do not fit each other.
+
+    Raises:
+        ValueError: If shapes, dtypes or devices do not agree.
+    """
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"points must have shape [N, 3], got {tuple(points.shape)}")
     last = levels[-1].tolist() if levels.ndim == 2 and levels.shape[1:] == (3,) and not levels.is_cuda else None

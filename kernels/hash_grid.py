@@ -1,4 +1,4 @@
-"""Hash features as a module, with an optimizer step that visits only what was hit."""
+"""Hash features as a module, with an optimizer step that visits only the entries that have a gradient."""
 
 import math
 from dataclasses import dataclass
@@ -12,10 +12,12 @@ from mgavatar.kernels.bridge import launch_ranges
 from mgavatar.kernels.hash_encode import BLOCK, HashEncode, TableGradient, check_inputs
 from mgavatar.kernels.precision import Real, by_dtype
 
-_BLOCKS = 32  # blocks of one CPU item in the optimizer step
+_BLOCKS = 32  # blocks per CPU item in the optimizer step
 
 
-# Adam (Kingma and Ba 2015) on the numbers whose gradient is not zero; the others keep value and moments.
+# Adam (Kingma and Ba 2015) on the numbers whose gradient is not zero; the others keep their value and moments. Blocks
+# without a mark are skipped whole. Inside a block all numbers are computed and then selected: the loop has no branch,
+# so it becomes vector instructions.
 _ADAM = """
     const long long per_block = (long long)features * BLOCK;
 #ifdef __CUDA_ARCH__
@@ -73,7 +75,7 @@ def _kernels(real: Real) -> SimpleNamespace:
     def adam_kernel(
         # In:
         first: int,
-        width: int,  # numbers an item owns
+        width: int,  # numbers per item
         rate: scalar,
         unbias: scalar,
         beta1: scalar,
@@ -108,7 +110,7 @@ class HashGridShape:
     log2_table_size: int = 19
 
     def __post_init__(self) -> None:
-        """Refuse sizes that no table fits.
+        """Refuse sizes that no table can have.
 
         Raises:
             ValueError: If a number is out of range.
@@ -123,7 +125,10 @@ class HashGridShape:
             raise ValueError(f"log2_table_size must be 1 to 24, got {self.log2_table_size}")
 
     def table_levels(self) -> Tensor:
-        """Resolution, first entry and number of entries of each level, shape [L, 3], int32; entries fill blocks."""
+        """List resolution, first entry and number of entries of each level, shape [L, 3], int32.
+
+        Levels start at whole blocks, so that a block's mark belongs to one level.
+        """
         ratio = self.max_resolution / self.base_resolution
         rows, first = [], 0
         for level in range(self.levels):
@@ -139,12 +144,12 @@ class HashGrid(nn.Module):
     """Multiresolution hash features with their own optimizer (Section 3.2).
 
     The gradient of ``table`` does not appear in ``table.grad``: backward adds it to a buffer of the module, and
-    :meth:`adam_step` visits only what it touched. Leave ``table`` out of torch's optimizers. The moments and the number
-    of steps are in ``state_dict``; a gradient that no step has used yet is not.
+    :meth:`adam_step` visits only the blocks that have one. Leave ``table`` out of torch's optimizers. ``state_dict``
+    holds the moments and the number of steps, but not a gradient that no step has used yet.
 
     Attributes:
         shape: Size of the grid.
-        n_outputs: Features a point gets, L F.
+        n_outputs: Features per point, L F.
     """
 
     def __init__(self, shape: HashGridShape | None = None, *, seed: int = 0) -> None:
@@ -166,10 +171,10 @@ class HashGrid(nn.Module):
         self._step = 0
 
     def forward(self, points: Tensor) -> Tensor:
-        """Features of points. Differentiable in ``points``; the table's gradient goes to :meth:`adam_step`.
+        """Encode points. Differentiable in ``points``; the table's gradient goes to :meth:`adam_step`.
 
         Args:
-            points: Points, held inside the unit cube (NaN counts as 0), shape [N, 3], dtype of the table.
+            points: Points, clamped to the unit cube (NaN counts as 0), shape [N, 3], dtype of the table.
 
         Returns:
             Features, level by level, shape [N, L F].
@@ -186,18 +191,19 @@ class HashGrid(nn.Module):
         return self._owned
 
     def table_gradient(self) -> Tensor:
-        """A copy of the gradient that waits for :meth:`adam_step`, shape [T, F]."""
+        """Copy the gradient that waits for :meth:`adam_step`, shape [T, F]."""
         return self._gradient.clone()
 
     @torch.no_grad()
     def adam_step(self, lr: float, *, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-15) -> None:
-        """One step of Adam on the numbers whose gradient is not zero, which is then cleared.
+        """Step Adam on the numbers whose gradient is not zero, then clear the gradient.
 
-        The others keep their value and their moments, as in torch's SparseAdam; the bias correction counts all steps.
+        The other numbers keep their value and their moments, as in torch's SparseAdam; the bias correction counts all
+        steps.
 
         Args:
             lr: Learning rate.
-            betas: Decay of the two moments.
+            betas: Decay rates of the two moments.
             eps: Added to the root of the second moment.
         """
         self._step += 1
@@ -211,9 +217,9 @@ class HashGrid(nn.Module):
         torch.autograd.graph.increment_version(self.table)
 
     def get_extra_state(self) -> dict[str, int]:
-        """Number of optimizer steps, kept in ``state_dict``."""
+        """Return the number of optimizer steps for ``state_dict``."""
         return {"step": self._step}
 
     def set_extra_state(self, state: dict[str, int]) -> None:
-        """Take over the number of optimizer steps from a ``state_dict``."""
+        """Take the number of optimizer steps from a ``state_dict``."""
         self._step = int(state["step"])

@@ -1,7 +1,7 @@
 """Kernels of the kinematic chain: rotation vectors to transforms, and back.
 
-One thread walks the few joints, in float64: a float32 angle of 1e4 rad is only good to 6e-4 rad once its length has
-been rounded, and the cost is that of a launch either way.
+One thread walks the few joints, in float64: float32 rounds the angle of a rotation vector of 1e4 rad to 6e-4 rad, and
+with five joints the launch costs more than the mathematics.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ _F = wp.float64
 
 @wp.func
 def _sinc(x: _F) -> _F:
-    """``sin(x) / x``."""
+    """Return ``sin(x) / x``, by its series near zero."""
     if wp.abs(x) < _F(1e-4):
         return _F(1.0) - x * x / _F(6.0)
     return wp.sin(x) / x
@@ -32,7 +32,10 @@ def _skew(w: wp.vec3d) -> wp.mat33d:
 
 @wp.func
 def _rotation_less_identity(w: wp.vec3d) -> wp.mat33d:
-    """``R(w) - I = a K + b (w w^T - |w|^2 I)`` with ``a = sin t / t`` and ``b = (1 - cos t) / t^2`` (Rodrigues)."""
+    """Return ``R(w) - I = a K + b (w w^T - |w|^2 I)``, a = sin t / t, b = (1 - cos t) / t^2 (Rodrigues).
+
+    Without the identity nothing cancels for small angles. With half = sinc(t / 2), b is half^2 / 2: no 0 / 0 at zero.
+    """
     angle = wp.length(w)
     half = _sinc(_F(0.5) * angle)
     b = _F(0.5) * half * half
@@ -41,9 +44,10 @@ def _rotation_less_identity(w: wp.vec3d) -> wp.mat33d:
 
 @wp.func
 def _rotation_bwd(w: wp.vec3d, grad: wp.mat33d) -> wp.vec3d:
-    """Gradient of the rotation vector from that of its matrix.
+    """Return the gradient of a rotation vector from that of its matrix.
 
-    ``a' / t`` and ``b' / t`` lose their digits where their terms cancel, below an angle of 1: there they are series.
+    ``da = a' / t`` and ``db = b' / t`` lose their digits to cancellation below an angle of 1: there they are Taylor
+    series in Horner's form, accurate to float64.
     """
     t2 = wp.dot(w, w)
     angle = wp.sqrt(t2)
@@ -118,7 +122,8 @@ def _joints_bwd_kernel(
 ) -> None:
     n = joints.shape[0]
     for i in range(n):
-        j = n - 1 - i  # children before parents
+        # Children before parents: a joint's gradient is complete once all its descendants have added to it.
+        j = n - 1 - i
         g = grad_transforms[j]
         g_t = wp.vec3d(g[0, 3], g[1, 3], g[2, 3])
         g_block = wp.mat33d(g[0, 0], g[0, 1], g[0, 2], g[1, 0], g[1, 1], g[1, 2], g[2, 0], g[2, 1], g[2, 2])
@@ -147,10 +152,11 @@ def _joints_bwd_kernel(
 
 
 class JointTransforms(torch.autograd.Function):
-    """The chain as a node of torch's graph; ``lbs.joint_transforms`` checks."""
+    """A node of torch's graph: the kinematic chain. ``lbs.joint_transforms`` checks its inputs."""
 
     @staticmethod
     def forward(ctx: Any, joints: Tensor, poses: Tensor, parents: Tensor) -> Any:
+        """Return transforms [J, 4, 4] and the pose feature [9 (J-1)] of joints [J, 3] and rotation vectors [J, 3]."""
         exact = joints.double().contiguous(), poses.double().contiguous()
         n = len(joints)
         transforms, feature, rotations, posed = (exact[0].new_zeros(n, *s) for s in ((4, 4), (9,), (3, 3), (3,)))
@@ -161,6 +167,7 @@ class JointTransforms(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad_transforms: Tensor, grad_feature: Tensor) -> Any:
+        """Return the gradients of joints and rotation vectors, each [J, 3]."""
         joints, poses, parents, rotations = ctx.saved_tensors
         n = len(joints)
         grad_features = joints.new_zeros(n, 9)

@@ -26,6 +26,8 @@ def laplacian_matrix(faces: Tensor, n_verts: int) -> SparseMatrix:
         raise ValueError(f"faces must have shape [F, 3], got {tuple(faces.shape)}")
     if faces.numel() and not (int(faces.min()) >= 0 and int(faces.max()) < n_verts):
         raise ValueError(f"faces index {int(faces.min())}..{int(faces.max())} but there are {n_verts} vertices")
+    # Each directed edge as one number, so that `unique` counts an edge once however many faces share it, and both
+    # directions of it are there even on a rim.
     corners = faces.long()
     pairs = torch.cat([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     pairs = pairs[pairs[:, 0] != pairs[:, 1]]
@@ -40,7 +42,7 @@ def laplacian_matrix(faces: Tensor, n_verts: int) -> SparseMatrix:
 
 
 def laplacian(matrix: SparseMatrix, x: Tensor) -> Tensor:
-    """Laplacian of any per-vertex values (Eq. 6). Differentiable in ``x``.
+    """Apply the Laplacian to per-vertex values (Eq. 6). Differentiable in ``x``.
 
     Args:
         matrix: Made by :func:`laplacian_matrix`, shape [V, V].

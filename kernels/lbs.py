@@ -1,7 +1,7 @@
-"""Blend shapes, joints and linear blend skinning: what poses a head model.
+"""Blend shapes, joints and linear blend skinning: the operations that pose a head model.
 
-The adjoints are written by hand: sums over directions, vertices and joints are loops that Warp would not replay. All
-of them add up in a fixed order, by one thread or many. The kernels of the first two are in ``blend.py`` and
+The adjoints are written by hand: sums over directions, vertices and joints are loops that Warp would not replay. They
+add up in a fixed order, with one thread or many. Kernels of blend shapes and joints are in ``blend.py`` and
 ``joints.py``.
 """
 
@@ -18,7 +18,7 @@ from mgavatar.kernels.bridge import launch, launch_ranges
 from mgavatar.kernels.joints import JointTransforms
 from mgavatar.kernels.precision import Real, by_dtype, pick
 
-_CHUNK = 128  # vertices whose share of a transform's gradient one item adds up
+_CHUNK = 128  # vertices per item in the gradient of a transform
 
 
 def _kernels(real: Real) -> SimpleNamespace:
@@ -29,7 +29,7 @@ def _kernels(real: Real) -> SimpleNamespace:
 
     @wp.func
     def blended(v: int, weights: wp.array2d[scalar], transforms: wp.array[mat44]) -> mat44:
-        """The transform of a vertex: its joints' transforms by their weights."""
+        """Blend the joints' transforms by a vertex's weights."""
         total = mat44()
         for j in range(transforms.shape[0]):
             total += weights[v, j] * transforms[j]
@@ -171,10 +171,10 @@ def blend_shapes(v_template: Tensor, dirs: Tensor, coeffs: Tensor) -> Tensor:
 
 
 def skin(verts: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Linear blend skinning: each vertex moves by its joints' transforms, by their weights.
+    """Skin vertices: move each by its joints' transforms, blended with its weights (linear blend skinning).
 
-    Differentiable in ``verts`` and ``transforms``, not in ``weights``. Weights are used as they are: a vertex whose
-    weights do not sum to 1 is drawn towards or away from the origin, as the formula says.
+    Differentiable in ``verts`` and ``transforms``, not in ``weights``. Weights are not normalised: a vertex whose
+    weights sum to less than 1 is drawn towards the origin, as the formula says.
 
     Args:
         verts: Rest vertices [m], shape [V, 3], float32 or float64.
@@ -202,7 +202,7 @@ def skin(verts: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
 
 
 def joint_transforms(joints: Tensor, poses: Tensor, parents: Tensor) -> tuple[Tensor, Tensor]:
-    """Pose a kinematic chain: what carries rest-pose points with each joint, and the pose correctives' feature.
+    """Pose a kinematic chain: return each joint's transform of rest-pose points, and the pose correctives' feature.
 
     Each joint rotates about itself, the root about the root joint. Differentiable in ``joints`` and ``poses``, at any
     angle.
@@ -210,10 +210,11 @@ def joint_transforms(joints: Tensor, poses: Tensor, parents: Tensor) -> tuple[Te
     Args:
         joints: Joints in the rest pose [m], shape [J, 3], float32 or float64.
         poses: Rotation vectors [rad], shape [J, 3].
-        parents: Parent of each joint, before it in the list, -1 for a root, shape [J], integers.
+        parents: Parent of each joint, which must come before it, or -1 for a root, shape [J], integers.
 
     Returns:
-        Rest to posed space, shape [J, 4, 4], and the row-major ``R_j - I`` of joints 1 to J-1, shape [9 (J-1)].
+        Transforms from rest to posed space, shape [J, 4, 4], and ``R_j - I`` of joints 1 to J-1, row by row, shape
+        [9 (J-1)].
 
     Raises:
         ValueError: If shapes, dtypes or devices do not agree, or a parent does not come before its child.

@@ -1,10 +1,10 @@
-"""Small fully connected networks of many points on a CPU: layers with ReLU between them, both directions fused.
+"""Small fully connected networks over many points on a CPU: linear layers with ReLU between them, fused.
 
 A tile of points goes through all layers while its numbers are in the cache. All three products of a layer (values,
 gradient of the inputs, gradient of the weights) are one loop that keeps eight rows by two vectors of sums in registers.
-Nothing is kept for the backward pass: evaluating a tile again costs less than writing and reading its hidden layers.
-Points whose gradient is zero, such as those of Gaussians that no pixel saw, are passed over there. On CUDA, and for
-networks wider than the tiles, torch's own layers are used.
+Nothing is stored for the backward pass: evaluating a tile again costs less than writing and reading its hidden layers.
+The backward pass skips points whose gradient is zero, such as those of Gaussians that no pixel saw. CUDA, and networks
+wider than a tile, use torch's own layers.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from mgavatar.kernels import bridge
 wp.set_module_options({"enable_backward": False})
 
 WIDEST = 256
-"""Most channels of a layer that fit into a tile."""
+"""Largest number of channels per layer that a tile holds."""
 
 WIDEST_TOGETHER = 1024
-"""Most channels of all layers' inputs together."""
+"""Largest number of input channels of all layers together that a tile holds."""
 
 _PAD = 16  # rows of weights and of a tile are padded to so many numbers
-_POINTS = 64  # of a tile
-_ITEMS = 16  # work items; each has sums of its own, so results do not depend on the number of threads
+_POINTS = 64  # points per tile
+_ITEMS = 16  # work items, each with sums of its own: results do not depend on the number of threads
 
 _COMMON = """
 #if defined(__AVX512F__)
@@ -276,7 +276,7 @@ def _pad(matrix: Tensor) -> Tensor:
 
 
 def _table(weights: Sequence[Tensor]) -> Tensor:
-    """What the kernels know of the layers, shape [L, 4]."""
+    """Return each layer's inputs, outputs, first weight and first bias, as the kernels read them, shape [L, 4]."""
     rows, weight, bias = [], 0, 0
     for matrix in weights:
         n_out, n_in = matrix.shape
@@ -316,7 +316,7 @@ class _Mlp(torch.autograd.Function):
 
 
 def _unpadded(weights: Sequence[Tensor], layers: Tensor, v_weights: Tensor, v_biases: Tensor) -> list[Tensor]:
-    """Gradients of each layer's weight and bias."""
+    """Cut the gradients of each layer's weight and bias out of the padded sums."""
     grads = []
     for n_in, n_out, weight, bias in layers.tolist():
         matrix = v_weights[weight : weight + _up(n_in) * _up(n_out)].view(_up(n_out), _up(n_in))
@@ -325,13 +325,13 @@ def _unpadded(weights: Sequence[Tensor], layers: Tensor, v_weights: Tensor, v_bi
 
 
 def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, extra: Tensor | None = None) -> Tensor:
-    """Apply linear layers with ReLU between them to many points. Differentiable in everything.
+    """Apply linear layers with ReLU between them to many points. Differentiable in all tensors.
 
     Args:
         x: Inputs, shape [N, C].
-        weights: Of each layer, shape [outputs, inputs], as in ``torch.nn.Linear``.
-        biases: Of each layer, shape [outputs].
-        extra: More inputs, which follow those of ``x``, shape [N, C'].
+        weights: Weight of each layer, shape [outputs, inputs], as in ``torch.nn.Linear``.
+        biases: Bias of each layer, shape [outputs].
+        extra: More inputs, appended to those of ``x``, shape [N, C'].
 
     Returns:
         Outputs of the last layer, shape [N, K].
@@ -352,13 +352,13 @@ def mlp(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], *, extra
 
 
 def linear_layers(network: nn.Sequential) -> tuple[list[Tensor], list[Tensor]]:
-    """Weights and biases of a network's linear layers, for :func:`mlp`; what is between them must be ReLU."""
+    """List weights and biases of a network's linear layers for :func:`mlp`; the layers between them must be ReLU."""
     layers = [layer for layer in network if isinstance(layer, nn.Linear)]
     return [layer.weight for layer in layers], [layer.bias for layer in layers]
 
 
 def _fits(weights: Sequence[Tensor]) -> bool:
-    """Whether a tile holds the network."""
+    """Return True if a tile holds the network."""
     together = sum(_up(matrix.shape[1]) for matrix in weights)
     return max(max(matrix.shape) for matrix in weights) <= WIDEST and together <= WIDEST_TOGETHER
 

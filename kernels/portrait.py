@@ -1,7 +1,7 @@
 """Ray-traced pictures of a synthetic person: solid textures, lights, antialiasing, in one pass over the pixels.
 
-Textures are functions of the point where a surface rests in the *template*, relative to the middle of the eyes [m], so
-they stick to the moving surface. Everything is a picture to fit to, never a gradient: the module has no adjoint code.
+Textures are functions of a surface point's place in the *template* at rest, relative to the middle of the eyes [m], so
+they stick to the moving surface. The pictures are data to fit to: the module has no adjoints.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 SKIN, EYE, TEETH, MOUTH, CLOTH = (wp.constant(i) for i in range(5))
 N_SAMPLES = 16
-"""Rays of a pixel on a silhouette or an edge of colour; an even pixel is content with the first four."""
+"""Rays per pixel on a silhouette or an edge of colour; a pixel of one colour takes only the first four."""
 
 
 @wp.struct
@@ -53,20 +53,21 @@ class View:
 
 @wp.func
 def blob(point: wp.vec3, center: wp.vec3, radius: float) -> float:
-    """1 at the centre, falling off as a Gaussian; symmetric left to right."""
+    """Return 1 at the centre, falling off as a Gaussian; mirrored from the left to the right."""
     offset = (wp.vec3(wp.abs(point[0]), point[1], point[2]) - center) / radius
     return wp.exp(-0.5 * wp.dot(offset, offset))
 
 
 @wp.func
 def step_between(low: float, high: float, x: float) -> float:
+    """Return 0 below ``low``, 1 above ``high``, and a smooth cubic between them."""
     t = wp.clamp((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 @wp.func
 def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32) -> float:
-    """A random number of a lattice point, -1..1."""
+    """Hash a lattice point to a number in -1..1."""
     h = x * wp.uint32(73856093) ^ y * wp.uint32(19349663) ^ z * wp.uint32(83492791) ^ seed * wp.uint32(1640531527)
     h = (h ^ (h >> wp.uint32(15))) * wp.uint32(2146121005)
     h = (h ^ (h >> wp.uint32(13))) * wp.uint32(1183186591)
@@ -75,7 +76,7 @@ def lattice(x: wp.uint32, y: wp.uint32, z: wp.uint32, seed: wp.uint32) -> float:
 
 @wp.func
 def noise(seed: wp.uint32, point: wp.vec3) -> float:
-    """Value noise, -1..1: random numbers on the integer lattice, joined smoothly; much faster than Perlin's."""
+    """Interpolate random numbers of the integer lattice smoothly (value noise), -1..1; much faster than Perlin's."""
     low = wp.vec3(wp.floor(point[0]), wp.floor(point[1]), wp.floor(point[2]))
     t = point - low
     f = wp.cw_mul(wp.cw_mul(t, t), wp.vec3(3.0, 3.0, 3.0) - 2.0 * t)
@@ -96,7 +97,7 @@ def noise(seed: wp.uint32, point: wp.vec3) -> float:
 
 @wp.func
 def noise2(seed: wp.uint32, x: float, y: float) -> float:
-    """Value noise in the plane, -1..1."""
+    """Interpolate value noise in the plane, -1..1."""
     i, j = wp.floor(x), wp.floor(y)
     s, t = x - i, y - j
     s, t = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
@@ -108,7 +109,7 @@ def noise2(seed: wp.uint32, x: float, y: float) -> float:
 
 @wp.func
 def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32) -> float:
-    """Round spots, at most one in each cell of a grid [m]: 1 inside, 0 outside."""
+    """Draw round spots, at most one per cell of a grid [m]: 1 inside, 0 outside."""
     grid = point / cell
     corner = wp.vec3(wp.floor(grid[0]), wp.floor(grid[1]), wp.floor(grid[2]))
     x, y, z = wp.uint32(wp.int32(corner[0])), wp.uint32(wp.int32(corner[1])), wp.uint32(wp.int32(corner[2]))
@@ -122,7 +123,7 @@ def spots(point: wp.vec3, cell: float, chance: float, seed: wp.uint32) -> float:
 
 @wp.func
 def strands(point: wp.vec3, seed: wp.uint32) -> float:
-    """Brightness of hair, -1..1: noise stretched along the way from the crown outwards, in wavy clumps."""
+    """Return the brightness of hair, -1..1: noise stretched from the crown outwards, in wavy clumps."""
     arm = point - wp.vec3(0.0, 0.0, -0.075)
     around = wp.atan2(arm[0], arm[2])
     above = wp.atan2(arm[1] - 0.02, wp.length(wp.vec2(arm[0], arm[2])))
@@ -136,7 +137,7 @@ def strands(point: wp.vec3, seed: wp.uint32) -> float:
 
 @wp.func
 def brow(point: wp.vec3, look: Look) -> float:
-    """Cover of the eyebrow hairs, 0..1: an arc above each eye, drawn as slanted strokes."""
+    """Return how much of a point eyebrow hairs cover, 0..1: an arc above each eye, made of slanted strokes."""
     x = wp.abs(point[0])
     along = (x - 0.013) / 0.036
     arc = 0.0185 + 0.0075 * wp.sin(1.9 * wp.clamp(along, 0.0, 1.0)) - 0.004 * along
@@ -149,7 +150,7 @@ def brow(point: wp.vec3, look: Look) -> float:
 
 @wp.func
 def skin_color(point: wp.vec3, lips: float, look: Look) -> wp.vec3:
-    """Skin with mottling, flushed cheeks, freckles, stubble, brows and lips."""
+    """Compute the colour of skin: mottling, flushed cheeks, freckles, stubble, brows and lips."""
     mottle = noise(look.seed, 55.0 * point) + 0.6 * noise(look.seed, 190.0 * point)
     pores = noise(look.seed, 620.0 * point)
     color = look.skin * (1.0 + 0.10 * mottle + 0.07 * pores)
@@ -179,7 +180,7 @@ def skin_color(point: wp.vec3, lips: float, look: Look) -> wp.vec3:
 
 @wp.func
 def eye_color(point: wp.vec3, look: Look) -> wp.vec3:
-    """Pupil, fibred iris with a dark rim, and a veined white."""
+    """Compute the colour of an eye: pupil, fibred iris with a dark rim, veined white."""
     center = wp.vec3(wp.sign(point[0]) * look.eye_offset[0], look.eye_offset[1], look.eye_offset[2])
     out = wp.normalize(point - center)
     radius = wp.acos(wp.clamp(out[2], -1.0, 1.0)) * look.eye_radius
@@ -195,7 +196,7 @@ def eye_color(point: wp.vec3, look: Look) -> wp.vec3:
 
 @wp.func
 def cloth_color(point: wp.vec3, collar: float, look: Look) -> wp.vec3:
-    """A knitted weave with one of four patterns and a ribbed collar."""
+    """Compute the colour of the garment: a knitted weave with one of four patterns and a ribbed collar."""
     around = wp.atan2(point[0], point[2] + 0.08)
     across = 0.7 * around * (0.09 + 0.6 * wp.length(wp.vec2(point[0], point[2] + 0.08)))
     ink = 0.0
@@ -215,7 +216,7 @@ def cloth_color(point: wp.vec3, collar: float, look: Look) -> wp.vec3:
 
 @wp.func
 def light_direction(i: int) -> wp.vec3:
-    """From the surface to light i: key, fill and rim, fixed in the world."""
+    """Return the direction from the surface to light i: key, fill and rim, fixed in the world."""
     if i == 0:
         return wp.normalize(wp.vec3(0.55, 0.65, 0.85))
     if i == 1:
@@ -225,6 +226,7 @@ def light_direction(i: int) -> wp.vec3:
 
 @wp.func
 def light_color(i: int) -> wp.vec3:
+    """Return the colour of light i, linear RGB."""
     if i == 0:
         return wp.vec3(1.72, 1.62, 1.48)
     if i == 1:
@@ -234,7 +236,7 @@ def light_color(i: int) -> wp.vec3:
 
 @wp.func
 def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: float) -> float:
-    """Normalized Blinn-Phong with Schlick's Fresnel term."""
+    """Compute a normalised Blinn-Phong highlight with Schlick's Fresnel term."""
     half = wp.normalize(view + light)
     grazing = 1.0 - wp.max(wp.dot(view, half), 0.0)
     fresnel = base + (1.0 - base) * grazing * grazing * grazing * grazing * grazing
@@ -243,7 +245,7 @@ def gloss(normal: wp.vec3, view: wp.vec3, light: wp.vec3, power: float, base: fl
 
 @wp.func
 def hair_gloss(flow: wp.vec3, normal: wp.vec3, view: wp.vec3, light: wp.vec3, shift: float) -> float:
-    """Highlight of a bundle of fibres along ``flow``, shifted towards the roots (Kajiya and Kay)."""
+    """Compute the highlight of fibres along ``flow``, shifted towards the roots (Kajiya and Kay)."""
     tangent = wp.normalize(flow + shift * normal)
     along = wp.dot(tangent, wp.normalize(view + light))
     return 0.30 * wp.pow(wp.sqrt(wp.max(1.0 - along * along, 0.0)), 70.0)
@@ -251,7 +253,7 @@ def hair_gloss(flow: wp.vec3, normal: wp.vec3, view: wp.vec3, light: wp.vec3, sh
 
 @wp.func
 def encode(color: wp.vec3) -> wp.vec3:
-    """Linear to display values: a soft shoulder, then sRGB's power law (without its linear toe)."""
+    """Convert linear to display values: a soft shoulder, then sRGB's power law without its linear toe."""
     out = wp.vec3()
     for i in range(3):
         out[i] = wp.pow(1.0 - wp.exp(-1.25 * wp.max(color[i], 0.0)), 0.4545)
@@ -260,12 +262,13 @@ def encode(color: wp.vec3) -> wp.vec3:
 
 @wp.func
 def mix3(values: wp.array[wp.vec3], corners: wp.vec3i, weights: wp.vec3) -> wp.vec3:
+    """Interpolate a triangle's vertex values."""
     return values[corners[0]] * weights[0] + values[corners[1]] * weights[1] + values[corners[2]] * weights[2]
 
 
 @wp.func
 def lit(mesh: wp.uint64, point: wp.vec3, normal: wp.vec3, light: wp.vec3) -> float:
-    """1 where nothing stands between the point and the key light; a hard shadow, softened by the pixel's samples."""
+    """Return 1 where nothing hides the key light: a hard shadow, softened by the pixel's samples."""
     if wp.dot(normal, light) <= 0.0:
         return 0.25
     if wp.mesh_query_ray_anyhit(mesh, point + 0.002 * normal + 0.001 * light, light, 0.5):
@@ -278,7 +281,7 @@ def shade(
     mesh: wp.uint64, kind: int, rest: wp.vec3, marks: wp.vec4, point: wp.vec3, normal_in: wp.vec3, flow: wp.vec3,
     view: wp.vec3, look: Look,
 ) -> wp.vec3:  # fmt: skip
-    """Light that leaves a point towards the camera; ``marks`` are hair, lips, open sky and collar, 0..1."""
+    """Return the light that a point sends to the camera; ``marks`` are hair, lips, open sky and collar, 0..1."""
     threads = wp.float32(0.0)
     hair = wp.float32(0.0)
     power, base, rough, wrap = 22.0, 0.035, 0.10, 0.30
@@ -378,7 +381,7 @@ def portrait(
     n_pixels: int,
     surface: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor],
 ) -> Tensor:
-    """Picture of a synthetic person: colour and cover of every pixel of ``view``'s rectangle, row by row.
+    """Render a synthetic person: colour and alpha of every pixel of ``view``'s rectangle, row by row.
 
     Diffuse and Blinn-Phong light with Schlick's Fresnel term, Kajiya-Kay highlights on hair, one shadowing light.
 
@@ -386,14 +389,14 @@ def portrait(
         mesh: The posed surface [m].
         view: Camera and rectangle.
         look: Colours and patterns.
-        samples: Positions inside a pixel, in 0..1, shape [S, 2], float32; the first four decide whether the rest is
-            needed.
+        samples: Positions inside a pixel, in 0..1, shape [S, 2], float32; only where the first four
+            differ are the others drawn.
         n_pixels: Pixels in the rectangle, P.
-        surface: ``faces`` [F, 3] int32, their material [F] int32; for each vertex its resting point [m] [V, 3],
-            marks (hair, lips, open sky, collar) [V, 4], unit normal [V, 3] and hair direction [V, 3], float32.
+        surface: ``faces`` [F, 3] int32, their material [F] int32; per vertex its resting point [m] [V, 3], marks (hair,
+            lips, open sky, collar) [V, 4], unit normal [V, 3] and hair direction [V, 3], float32.
 
     Returns:
-        Display colour times cover, and cover, each in 0..1, shape [P, 4], float32.
+        Display colour times alpha, and alpha, each in 0..1, shape [P, 4], float32.
 
     Raises:
         ValueError: If the parts of ``surface`` differ in length.

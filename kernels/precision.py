@@ -1,7 +1,7 @@
 """Kernels in float32 and float64: written once, picked by the dtype of the tensors.
 
-Fits run in float32. The float64 build exists so that gradients can be checked against finite differences. Each build
-is a Warp module of its own, so that a program which never asks for float64 does not compile it.
+Fits run in float32; the float64 build lets tests check gradients against finite differences. Each build is a Warp
+module of its own, so that a program that never asks for float64 does not compile it.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ _K = TypeVar("_K")
 
 @dataclass(frozen=True)
 class Real:
-    """A floating point type and what is made of it, for Warp kernels, C++ snippets and torch."""
+    """A floating point type and its vectors and matrices, as Warp, C++ snippets and torch call them."""
 
     name: str
     c_name: str  # not plain float: Warp makes float( a macro
@@ -39,7 +39,7 @@ def by_dtype(make: Callable[[Real], _K]) -> Mapping[torch.dtype, _K]:
 
 
 def pick(kernels: Mapping[torch.dtype, _K], **tensors: Tensor) -> _K:
-    """Take the build that fits ``tensors``.
+    """Return the build for the dtype of ``tensors``.
 
     Raises:
         ValueError: If the tensors are not all float32 or all float64, on one device.

@@ -1,15 +1,15 @@
-"""3D Gaussians to their footprints in the image, and the hand-written adjoint (EWA splatting).
+"""Projection of 3D Gaussians to their footprints in the image, with its hand-written adjoint (EWA splatting).
 
 A footprint is kept in *row form* rather than as a conic: with ``u = x - mx - shear (y - my)``,
 
     G(x, y) = exp(-(curvature u^2 + inv_var_y (y - my)^2) / 2).
 
-It is the same ellipse after completing the square in x. Both terms have one sign, so nothing cancels for needles, and
-the interval of pixels that a row shares with the ellipse is one square root.
+It is the same ellipse after completing the square in x. Both terms have the same sign, so nothing cancels for needles,
+and the pixels of a row inside the ellipse follow from one square root.
 
-All of it is computed in double precision whatever the arrays hold: a mean at 400 px has a rounding step of 3e-5 px in
-single precision, which alone would cost more accuracy than everything that follows. For the same reason the mean is
-stored as a whole pixel and a remainder.
+Everything is computed in double precision, whatever the arrays hold: single precision rounds a mean at 400 px to 3e-5
+px, a larger error than that of everything that follows. For the same reason the mean is stored as a whole pixel and a
+remainder.
 """
 
 from typing import Any
@@ -21,18 +21,18 @@ SPLAT = (
     "pixel_x", "pixel_y", "offset_x", "offset_y", "curvature", "shear", "inv_var_y", "opacity",
     "red", "green", "blue", "depth", "reach", "half_y", "radius", "unused",
 )  # fmt: skip
-"""Columns of a splat, one cache line in single precision.
+"""Columns of a splat: a cache line in single precision.
 
 The mean is the centre of (pixel_x, pixel_y), which are whole numbers, plus the offset [px]. The ellipse where alpha is
 at the threshold is ``curvature u^2 + inv_var_y (y - my)^2 = reach``; ``half_y`` is its half height, ``radius`` is
-``1 / sqrt(curvature)``. Reach and half height are a little larger, so that rounding never cuts a pixel off.
+``1 / sqrt(curvature)``. Reach and half height are slightly too large, so that rounding never cuts a pixel off.
 """
 
 NO_EXTENT = 1.0e30
-"""Reach without a threshold: a Gaussian touches every pixel."""
+"""Reach where there is no alpha threshold: a Gaussian touches every pixel."""
 
 LARGEST = 1.0e18
-"""Depths and colours beyond this are not drawn: their squares would not fit into single precision."""
+"""Gaussians with a larger depth or colour are not drawn: its square would not fit into single precision."""
 
 GRADIENT = ("mean_x", "mean_y", "curvature", "shear", "inv_var_y", "opacity", "red", "green", "blue", "depth")
 """Columns of a splat's gradient."""
@@ -40,6 +40,7 @@ GRADIENT = ("mean_x", "mean_y", "curvature", "shear", "inv_var_y", "opacity", "r
 
 @wp.func
 def _rotation_of(q: wp.vec4d) -> wp.mat33d:
+    """Return the rotation matrix of a unit quaternion wxyz."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     one, two = wp.float64(1.0), wp.float64(2.0)
     return wp.mat33d(
@@ -51,7 +52,7 @@ def _rotation_of(q: wp.vec4d) -> wp.mat33d:
 
 @wp.func
 def _rotation_vjp(q: wp.vec4d, r: wp.mat33d) -> wp.vec4d:
-    """Gradient of a unit quaternion from that of its rotation matrix."""
+    """Return the gradient of a unit quaternion from that of its rotation matrix."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     two = wp.float64(2.0)
     return two * wp.vec4d(
@@ -69,14 +70,14 @@ def _row(m: wp.mat33d, i: int) -> wp.vec3d:
 
 @wp.func
 def _limited(slope: wp.float64, focal: wp.float64, center: wp.float64, size: wp.float64) -> wp.float64:
-    """x/z kept within 15 % of the image beyond its border, where the linearisation still means something."""
+    """Limit x/z to 15 % of the image beyond its border: further out the linearised projection is meaningless."""
     margin = wp.float64(0.15) * size
     return wp.clamp(slope, -(center + margin) / focal, (size - center + margin) / focal)
 
 
 @wp.func
 def view_of(view_ids: wp.array[wp.int32], n: int) -> int:
-    """View that Gaussian ``n`` belongs to; without ids there is only one."""
+    """Return the view of Gaussian ``n``; without ids there is one view."""
     if view_ids.shape[0] == 0:
         return 0
     return view_ids[n]
@@ -149,7 +150,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         norm = wp.length(q)
         opacity = wp.float64(opacities[n])
         color_sq = wp.length_sq(wide3(colors[n]))
-        # Written so that a NaN anywhere fails them.
+        # Comparisons with NaN are false, so `not (a > b)` culls what `a <= b` would let through.
         if not (p[2] > near) or not (p[2] < largest) or not (color_sq < largest * largest):
             return
         if not (norm > wp.float64(1.0e-12)) or not (norm < wp.float64(1.0e12)):
@@ -185,7 +186,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             reach = wp.float64(2.0) * wp.log(opacity / alpha_threshold) + wp.float64(1.0e-3)
         half_x = wp.sqrt(reach * var_x) + wp.float64(0.01)
         half_y = wp.sqrt(reach * var_y) + wp.float64(0.01)
-        # Pixel i is touched if its centre i + 0.5 is within the half extent.
+        # A pixel i is touched if its centre i + 0.5 lies within the half extent.
         x0 = wp.clamp(wp.ceil(mx - half_x - half), zero, wp.float64(width))
         x1 = wp.clamp(wp.floor(mx + half_x + half), zero, wp.float64(width))
         y0 = wp.clamp(wp.ceil(my - half_y - half), zero, wp.float64(height))
@@ -236,7 +237,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         v_opacities: wp.array[real],  # [N]
         v_colors: wp.array[vec3],  # [N]
         v_means2d: wp.array2d[real],  # [N, 2]
-        v_viewmats: wp.array2d[wp.float64],  # [N, 12] share of each Gaussian, or empty
+        v_viewmats: wp.array2d[wp.float64],  # [N, 12] each Gaussian's share, or empty
     ):
         n = first + wp.tid()
         count = tiles_per_gauss[n]
@@ -266,7 +267,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         gy = (_row(g, 1) - uy * _row(g, 2)) * fy
         var_y = wp.dot(gy, gy) + low_pass
         cross = wp.cross(gx, gy)
-        # Row form to covariance: a = S / (P S - Q^2), b = Q / S, w = 1 / S for cov = [[P, Q], [Q, S]].
+        # From row form to covariance [[P, Q], [Q, S]]: a = S / (P S - Q^2), b = Q / S, w = 1 / S.
         a = var_y / (low_pass * (var_y + wp.dot(gx, gx)) + wp.dot(cross, cross))
         b = wp.dot(gx, gy) / var_y
         w = wp.float64(1.0) / var_y
@@ -281,6 +282,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         v_x = v[0] * fx
         v_y = v[1] * fy
         v_z = v[9] - v[0] * fx * sx - v[1] * fy * sy - (wp.dot(v_gx, gx) + wp.dot(v_gy, gy)) * rz
+        # Where x/z was clamped, the slope no longer depends on the mean.
         if ux == sx:
             v_x += v_ux * rz
             v_z -= v_ux * sx * rz

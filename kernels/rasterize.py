@@ -15,15 +15,15 @@ from mgavatar.kernels.tiling import MAX_ISECTS, WorkLists, build_work_lists
 Form = Literal["auto", "plain", "rows"]
 
 LEAST_STOP = 1e-30
-"""Where ``stop = 0`` ends a pixel: past it the transmittance would underflow and the adjoint could not walk back."""
+"""Transmittance that ends a pixel where ``stop`` is 0: below it T would underflow, and the adjoint starts from T."""
 
 LARGEST_CAP = 1.0 - 1e-6
-"""In single precision ``1 - alpha`` needs some bits left."""
+"""Largest alpha cap: in single precision ``1 - alpha`` must keep some bits."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RasterSettings:
-    """What the rasterizer leaves out, and where; ``docs/lab/tradeoffs.md`` has the price of each."""
+    """Approximations of the rasterizer; ``docs/lab/tradeoffs.md`` measures what each costs."""
 
     alpha_threshold: float = 1.0 / 255.0
     """Contributions below this alpha are skipped; 0 blends every Gaussian with every pixel."""
@@ -36,20 +36,20 @@ class RasterSettings:
     near: float = 0.01
     """Gaussians nearer than this are not drawn [m]."""
     form: Form = "auto"
-    """``plain`` is one thread a pixel, on any device and dtype; ``rows`` is the CPU's vector form in float32."""
+    """``plain`` is one thread per pixel, on any device and dtype; ``rows`` is the CPU's vector form in float32."""
     exp: Literal["polynomial", "exact"] = "polynomial"
-    """How the rows raise to a power: a polynomial of degree 6 in vectors, or the C library one by one."""
+    """Exponential of the ``rows`` form: a polynomial of degree 6 in vectors, or the C library's, number by number."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """What one camera sees, or several.
+    """Images of one camera, or of several.
 
     Attributes:
-        image: Composited colours, shape [3, H, W], of several views [B, 3, H, W].
+        image: Composited colours, shape [3, H, W], or [B, 3, H, W] of several views.
         alphas: Opacity of each pixel, 1 minus its final transmittance, shape [H, W] or [B, H, W].
         depths: Sum of blending weight times depth [m], not divided by ``alphas``, shape [H, W] or [B, H, W].
-        visible: Which Gaussians touch the image, shape [N], bool.
+        visible: True for the Gaussians that touch the image, shape [N], bool.
     """
 
     image: Tensor
@@ -98,7 +98,7 @@ def _check_views(view_ids: Tensor | None, means: Tensor, viewmat: Tensor) -> Non
             raise ValueError(f"view_ids needs several views, but viewmat has shape {tuple(viewmat.shape)}")
         return
     if view_ids is None:
-        raise ValueError(f"viewmat has shape {tuple(viewmat.shape)}, so view_ids has to say each Gaussian's view")
+        raise ValueError(f"viewmat has shape {tuple(viewmat.shape)}, so view_ids must give each Gaussian's view")
     if tuple(view_ids.shape) != (len(means),):
         raise ValueError(f"view_ids has shape {tuple(view_ids.shape)}, needs {(len(means),)}")
     if view_ids.dtype != torch.int32 or view_ids.device != means.device:
@@ -127,7 +127,7 @@ def _form(settings: RasterSettings, means: Tensor) -> Form:
 
 @dataclass(frozen=True)
 class Work:
-    """Projected Gaussians and who blends them, between the two halves of the rasterizer.
+    """Projected Gaussians and the tiles that blend them: what the two halves of the rasterizer hand over.
 
     Attributes:
         splats: Footprints, columns ``projection.SPLAT``, shape [N, 16].
@@ -149,17 +149,17 @@ class Work:
 
     @property
     def n_tiles(self) -> int:
-        """Tiles of all views' images."""
+        """Return the number of tiles of all views' images."""
         return len(self.lists.tile_begin)
 
     @property
     def tiles_per_view(self) -> int:
-        """Tiles of one view's image."""
+        """Return the number of tiles of one view's image."""
         return self.n_tiles // self.n_views
 
     @property
     def inputs(self) -> list[Any]:
-        """What both directions of the blending read."""
+        """List the arrays that both directions of the blending read."""
         lists = self.lists
         return [self.splats, lists.tile_begin, lists.tile_end, lists.isect_ids, lists.gaussian_ids]
 
@@ -167,7 +167,17 @@ class Work:
 def project(
     settings: RasterSettings, size: tuple[int, int], tensors: tuple[Tensor, ...], view_ids: Tensor | None = None
 ) -> Work:
-    """Find each Gaussian's footprint and list the tiles' work; ``tensors`` are checked and in the order of the op."""
+    """Find each Gaussian's footprint and list the tiles' work.
+
+    Args:
+        settings: Truncations and form.
+        size: Image width and height [px].
+        tensors: Checked inputs in the order of :func:`rasterize`: means to colors, viewmat, K, background.
+        view_ids: View of each Gaussian, shape [N], int32, or None for one view.
+
+    Returns:
+        The work of :func:`blend`.
+    """
     *gaussians, viewmat, K, _ = tensors
     means = gaussians[0]
     width, height = size
@@ -189,14 +199,23 @@ def project(
 
 
 def _by_view(background: Tensor, *tensors: Tensor) -> list[Tensor]:
-    """``tensors`` with the view as the first axis, as the kernels take them; one view's, as the op does, have none."""
+    """Give ``tensors`` the view as first axis, as the kernels take them; those of a single view do not have it yet."""
     return list(tensors) if background.ndim == 2 else [tensor[None] for tensor in tensors]
 
 
 def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tensor]:
-    """Composite: image [3, H, W], alphas, depths, final T [H, W] and the last entry that each pixel blended.
+    """Composite the Gaussians of each tile, front to back.
 
-    With a background of several views, [B, 3], all outputs have B as their first axis.
+    Args:
+        settings: Truncations and form.
+        work: Made by :func:`project`.
+        background: RGB, shape [3], or [B, 3] for several views; then all outputs have B as their first axis.
+
+    Returns:
+        Image [3, H, W], alphas, depths and final T [H, W], and the last entry that each pixel blended [H, W], int32.
+
+    Raises:
+        ValueError: If there are more than 2^31 - 1 pixels.
     """
     width, height = work.size
     if work.n_views * width * height > MAX_ISECTS:
@@ -219,7 +238,16 @@ def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tens
 def blend_backward(
     settings: RasterSettings, work: Work, background: Tensor, final_T: Tensor, last_ids: Tensor, v_planes: list[Tensor]
 ) -> Tensor:
-    """Compute the gradient of each intersection's splat, columns ``projection.GRADIENT``, shape [M, 10]."""
+    """Compute each intersection's share of its splat's gradient, shape [M, 10], columns ``projection.GRADIENT``.
+
+    Args:
+        settings: Truncations and form.
+        work: Made by :func:`project`.
+        background: As in :func:`blend`.
+        final_T: From :func:`blend`.
+        last_ids: From :func:`blend`.
+        v_planes: Gradients of image, alphas and depths.
+    """
     rows = work.form == "rows"
     # The rows write every intersection; the plain form on a CPU adds up threads that run one after the other.
     partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.isect_ids), 10)
@@ -235,7 +263,7 @@ def blend_backward(
 
 
 def _camera_gradient(shares: Tensor, view_ids: Tensor, viewmat: Tensor) -> Tensor:
-    """Sum of the Gaussians' shares [N, 12] in each view, in the order in which one view alone adds them."""
+    """Sum the Gaussians' shares [N, 12] of each view, in the order in which that view alone adds them."""
     v_viewmat = torch.zeros_like(viewmat)
     if viewmat.ndim == 2:
         v_viewmat[:3] = shares.sum(0).reshape(3, 4)
@@ -246,7 +274,7 @@ def _camera_gradient(shares: Tensor, view_ids: Tensor, viewmat: Tensor) -> Tenso
 
 
 def _background_gradient(v_image: Tensor, final_T: Tensor) -> Tensor:
-    """What each view's background gets; a sum a view, so that torch adds a view's pixels as if it were alone."""
+    """Return each view's background gradient; one sum per view has the same bits as that view alone."""
     if v_image.ndim == 3:
         return (v_image * final_T).sum((1, 2))
     return torch.stack([(v * T).sum((1, 2)) for v, T in zip(v_image, final_T, strict=True)])
@@ -314,14 +342,14 @@ def rasterize(
     """Draw Gaussians as a camera sees them (EWA splatting, front to back), or several cameras in one launch.
 
     Differentiable in the Gaussians, ``viewmat`` and ``background``; deterministic on every device and for any number
-    of threads. A Gaussian with a NaN, an infinity or a zero quaternion is not drawn and gets a zero gradient.
+    of threads. A Gaussian with a NaN, an infinity or a zero quaternion is not drawn; its gradient is zero.
 
     With B views, each Gaussian belongs to one of them; a view's image and gradients are, bit for bit, what its
     Gaussians give alone. Gaussians that several views see are repeated by the caller.
 
     Args:
         means: Centres in world space [m], shape [N, 3], float32 or float64.
-        quats: Rotations wxyz, normalised here; norms outside 1e-12..1e12 are not drawn, shape [N, 4].
+        quats: Rotations wxyz, normalised here, shape [N, 4]; Gaussians with norms outside 1e-12..1e12 are not drawn.
         scales: Standard deviations along the rotated axes [m], shape [N, 3].
         opacities: In 0..1, shape [N].
         colors: RGB, shape [N, 3].
@@ -337,7 +365,7 @@ def rasterize(
         Image, alphas, depths and visibility; the first three by view where there are several.
 
     Raises:
-        ValueError: If shapes, dtypes, devices or settings do not fit, ``view_ids`` name a view that is not there, or
+        ValueError: If shapes, dtypes, devices or settings do not fit, ``view_ids`` has an index outside the views, or
             the work exceeds 2^31 - 1 intersections or pixels.
     """
     settings = settings or RasterSettings()

@@ -1,6 +1,6 @@
-"""Triangle meshes hit by rays: distance, face and barycentric weights of the nearest hit.
+"""Rays cast at triangle meshes: distance, face and barycentric weights of the nearest hit.
 
-For synthetic captures, previews and visibility. Nothing here is differentiable, so the module has no adjoint code.
+For synthetic captures, previews and visibility. Nothing here is differentiable: the module has no adjoints.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ FAR = wp.constant(1.0e30)
 
 @wp.func
 def is_ray(origin: wp.vec3, direction: wp.vec3) -> bool:
-    """Whether a ray can hit anything; written so that NaN, infinity and a zero direction are all refused."""
+    """Return True if a ray can hit anything; NaN fails these comparisons, as infinity and a zero direction do."""
     length = wp.length_sq(direction)
     return length > 0.0 and length < FAR and wp.length_sq(origin) < FAR
 
@@ -75,11 +75,14 @@ class RayMesh:
 
     @property
     def id(self) -> int:
-        """The handle that kernels take as ``wp.uint64``; 0 for a mesh without faces, which kernels must not query."""
+        """Return the handle that kernels take as ``wp.uint64``; 0 for a mesh without faces: it must not be queried."""
         return 0 if self._mesh is None else int(self._mesh.id)
 
     def move(self, verts: Tensor) -> None:
-        """Move the vertices [m], shape [V, 3], float32, and refit the hierarchy: far cheaper than building it anew.
+        """Move the vertices and refit the hierarchy, which is far cheaper than building it.
+
+        Args:
+            verts: New positions [m], shape [V, 3], float32.
 
         Raises:
             ValueError: If the number of vertices changes or one is not finite.
@@ -93,7 +96,7 @@ class RayMesh:
                 self._mesh.refit()
 
     def cast(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The nearest hit of each ray, from either side of a face; see :func:`ray_cast`."""
+        """Find the nearest hit of each ray, from either side of a face; see :func:`ray_cast`."""
         for name, rays in (("origins", origins), ("directions", directions)):
             if rays.ndim != 2 or rays.shape[1] != 3 or rays.dtype != torch.float32:
                 raise ValueError(f"{name} must be float32 of shape [N, 3], got {rays.dtype} {tuple(rays.shape)}")
@@ -110,16 +113,16 @@ class RayMesh:
 
 
 def ray_cast(verts: Tensor, faces: Tensor, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The nearest hit of each ray with a mesh, from either side of a face.
+    """Find the nearest hit of each ray with a mesh, from either side of a face.
 
-    A zero or non-finite direction, or a non-finite origin, is a miss. The hit is
-    ``origins + depths * directions`` and, to rounding, the barycentric mean of its face's vertices.
+    A ray with a zero or non-finite direction, or a non-finite origin, misses. The hit point is
+    ``origins + depths * directions``; up to rounding it is the barycentric mean of its face's vertices.
 
     Args:
         verts: Vertices [m], shape [V, 3], float32.
         faces: Vertex indices, shape [F, 3], int32; F may be 0.
-        origins: Where the rays start [m], shape [N, 3], float32.
-        directions: Any length, shape [N, 3], float32.
+        origins: Starting points [m], shape [N, 3], float32.
+        directions: Directions of any length, shape [N, 3], float32.
 
     Returns:
         ``depths`` in units of the direction's length, inf for a miss, shape [N], float32; ``face_ids``, -1 for a miss,
@@ -134,7 +137,7 @@ def ray_cast(verts: Tensor, faces: Tensor, origins: Tensor, directions: Tensor) 
 def camera_rays(
     viewmat: Tensor, K: Tensor, width: int, height: int, *, offsets: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Rays through the pixels of a pinhole camera, row by row; depths along them are camera depths (z).
+    """Build rays through the pixels of a pinhole camera, row by row; depths along them are camera depths (z).
 
     Args:
         viewmat: World to camera, OpenCV axes, shape [4, 4].

@@ -1,4 +1,4 @@
-"""Faces of a mesh that cross other faces of it, for measuring geometry. Forward only."""
+"""Pairs of faces of one mesh that cross each other, for measuring geometry. Forward only."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def _volume(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d) -> wp.float64:
-    """Six times the signed volume of a tetrahedron; exactly 0 where ``d`` is another corner."""
+    """Return six times the signed volume of a tetrahedron; exactly 0 where ``d`` equals another corner."""
     return wp.dot(a - d, wp.cross(b - d, c - d))
 
 
 @wp.func
 def _pierces(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> bool:
-    """Whether a segment passes through the inside of a triangle; touching is not passing."""
+    """Return True if a segment passes through the inside of a triangle; touching does not count."""
+    # Its ends lie on different sides of the plane, and seen along it the triangle's edges all turn the same way.
     zero = wp.float64(0.0)
     above, below = _volume(a, b, c, p), _volume(a, b, c, q)
     if not above * below < zero:
@@ -31,13 +32,14 @@ def _pierces(p: wp.vec3d, q: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) ->
 
 @wp.func
 def _crosses(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d, e: wp.vec3d, f: wp.vec3d) -> bool:
-    """Where two triangles cross, the line that they share ends where a side of one passes through the other."""
+    """Return True if two triangles cross: then an edge of one of them passes through the other."""
     by_first = _pierces(a, b, d, e, f) or _pierces(b, c, d, e, f) or _pierces(c, a, d, e, f)
     return by_first or _pierces(d, e, a, b, c) or _pierces(e, f, a, b, c) or _pierces(f, d, a, b, c)
 
 
 @wp.func
 def _are_neighbours(face: wp.vec3i, other: wp.vec3i) -> bool:
+    """Return True if two faces have a vertex in common."""
     for i in range(3):
         if face[i] == other[0] or face[i] == other[1] or face[i] == other[2]:
             return True
@@ -56,8 +58,8 @@ def _crossings_kernel(
     mesh: wp.uint64,
     verts: wp.array[wp.vec3],  # [V]
     faces: wp.array[wp.vec3i],  # [F]
-    starts: wp.array[wp.int64],  # [F] where a face's partners go
-    n_places: wp.int64,  # P, 0 to count only
+    starts: wp.array[wp.int64],  # [F] first entry of each face in partners
+    n_places: wp.int64,  # P, or 0 to count only
     # Out:
     counts: wp.array[wp.int32],  # [F]
     partners: wp.array[wp.int32],  # [P]
@@ -70,9 +72,11 @@ def _crossings_kernel(
     m = wp.int32(0)
     while wp.mesh_query_aabb_next(query, m):
         other = faces[m]
+        # Each pair is tested once, by its smaller face.
         if m > n and not _are_neighbours(face, other):
             d, e, f = verts[other[0]], verts[other[1]], verts[other[2]]
             if _crosses(_double(a), _double(b), _double(c), _double(d), _double(e), _double(f)):
+                # The first pass has no room and only counts; the second has exactly the room that was counted.
                 if starts[n] + wp.int64(count) < n_places:
                     partners[starts[n] + wp.int64(count)] = m
                 count += 1
@@ -80,7 +84,7 @@ def _crossings_kernel(
 
 
 def crossing_faces(verts: Tensor, faces: Tensor) -> Tensor:
-    """Pairs of faces of a mesh that cross each other and have no vertex in common.
+    """List pairs of faces of a mesh that cross each other and have no vertex in common.
 
     Volumes are computed in double precision. Faces that only touch, and faces in one plane, do not cross.
 
@@ -108,6 +112,7 @@ def crossing_faces(verts: Tensor, faces: Tensor) -> Tensor:
     ends = counts.cumsum(0)
     partners = torch.empty(max(int(ends[-1]), 1), dtype=torch.int32, device=device)
     run(ends - counts, partners, int(ends[-1]))
+    # The hierarchy returns a face's partners in any order; one sort of (face, partner) as a single number orders both.
     owners = torch.arange(n_faces, device=device).repeat_interleave(counts.long())
     codes = (owners * n_faces + partners[: len(owners)].long()).sort().values
     return torch.stack([codes // n_faces, codes % n_faces], dim=1)

@@ -1,8 +1,8 @@
-"""Fixed sparse matrices applied to per-row values: gathers, averages and interpolations whose adjoint is a gather too.
+"""Fixed sparse matrices applied to per-row values: gathers, averages and interpolations, whose adjoint is a gather too.
 
 Subdivision, corners of faces, joint regression, the Laplacian and UV maps are all ``y = A x`` with an ``A`` that does
-not change. The matrix keeps its own transpose, so that the adjoint ``A^T g`` reads rows as the forward does: no atomic
-addition, and the same bits from run to run and for any number of threads.
+not change. The matrix keeps its transpose, so that the adjoint ``A^T g`` gathers rows as the forward pass does: no
+atomic addition, and the same bits from run to run and for any number of threads.
 """
 
 import math
@@ -22,7 +22,7 @@ from mgavatar.kernels.bridge import launch_ranges
 from mgavatar.kernels.precision import Real, by_dtype, pick
 
 _LIMIT = 2**31 - 1  # indices are int32
-_SEGMENT = 512  # entries that one item adds up; longer rows are added in two stages, for threads and for accuracy
+_SEGMENT = 512  # entries per item; longer rows are added in two stages, for balance between threads and for accuracy
 
 _ROW_SNIPPET = """
     const int begin = starts.data[row];
@@ -117,14 +117,18 @@ class _Rows:
 
 
 def _stages(csr: scipy.sparse.csr_array) -> tuple[_Rows, ...]:
-    """The matrix as one or two factors, such that no row of the first has very many entries."""
+    """Factor the matrix into one or two, such that no row of the first is very long.
+
+    A long row is cut into segments. The first factor adds up each segment; the second one adds up a row's segments.
+    """
     starts, cols, values = csr.indptr.astype(np.int64), csr.indices, csr.data
     lengths = np.diff(starts)
     if lengths.max(initial=0) <= 2 * _SEGMENT:
         return (_Rows.of(starts, cols, values),)
     counts = -(-lengths // _SEGMENT)
     row_starts = np.concatenate([[0], np.cumsum(counts)])
-    nth = np.arange(row_starts[-1]) - np.repeat(row_starts[:-1], counts)  # which segment of its row
+    nth = np.arange(row_starts[-1]) - np.repeat(row_starts[:-1], counts)  # number of each segment within its row
+    # Entries stay in place: a segment starts a multiple of _SEGMENT after its row and ends where the next one starts.
     segment_starts = np.append(np.repeat(starts[:-1], counts) + nth * _SEGMENT, starts[-1])
     n_segments = len(nth)
     return _Rows.of(segment_starts, cols, values), _Rows.of(row_starts, np.arange(n_segments), np.ones(n_segments))
@@ -135,11 +139,11 @@ class SparseMatrix:
 
     Attributes:
         shape: Rows M and columns N.
-        device: Where it can be applied.
+        device: Device of the values that it can be applied to.
     """
 
     def __init__(self, shape: tuple[int, int], stages: Sequence[_Rows], transposed: Sequence[_Rows]) -> None:
-        """Use :meth:`from_coo`."""
+        """Take factors of the matrix and of its transpose; use :meth:`from_coo` instead."""
         self.shape = shape
         self._stages = tuple(stages)
         self._transposed = tuple(transposed)
@@ -170,21 +174,21 @@ class SparseMatrix:
 
     @property
     def T(self) -> "SparseMatrix":
-        """The transpose, without a copy."""
+        """Return the transpose, without a copy."""
         return SparseMatrix((self.shape[1], self.shape[0]), self._transposed, self._stages)
 
     @property
     def device(self) -> torch.device:
-        """Where it can be applied."""
+        """Return the device of the values that it can be applied to."""
         return self._stages[0].cols.device
 
     def to(self, device: torch.device | str) -> "SparseMatrix":
-        """The same matrix on another device."""
+        """Return the same matrix on another device."""
         stages = [[rows.to(device) for rows in stages] for stages in (self._stages, self._transposed)]
         return SparseMatrix(self.shape, *stages)
 
     def multiply(self, x: Tensor) -> Tensor:
-        """``A x`` for x [N, C], outside torch's graph."""
+        """Compute ``A x`` for x [N, C] outside torch's graph, shape [M, C]."""
         for rows in self._stages:
             x = rows.multiply(x)
         return x

@@ -1,8 +1,9 @@
 """Mean absolute error and SSIM in one pass on a CPU (Eq. 4): 11x11 Gaussian window, sigma 1.5, zero padding.
 
-A work item is one tile of one channel: it is copied with its border into a local buffer, filtered down the columns and
-then along the rows, all sixteen pixels at a time. The adjoint filters three derivative maps; the window is symmetric,
-so it is its own transpose. Several times faster than convolutions, which on CUDA do well: see ``mgavatar/losses.py``.
+A work item is one tile of one channel: it is copied with its border into a local buffer, then filtered down the columns
+and along the rows, sixteen pixels at a time. The adjoint filters three derivative maps; the window is symmetric, so it
+is its own transpose. Several times faster than convolutions on a CPU; CUDA uses convolutions, see
+``mgavatar/losses.py``.
 """
 
 from __future__ import annotations
@@ -214,14 +215,14 @@ class _Compare(torch.autograd.Function):
 
 
 def compare_images(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute error and mean SSIM of two images. Differentiable in ``image``.
+    """Compute mean absolute error and mean SSIM of two images. Differentiable in ``image``.
 
     Args:
-        image: In 0..1, shape [3, H, W], float32, on a CPU.
-        target: Same shape.
+        image: Colours in 0..1, shape [3, H, W], float32, on a CPU.
+        target: Colours of the same shape.
 
     Returns:
-        Both means, shape [2].
+        The two means, shape [2].
 
     Raises:
         ValueError: If shapes, dtypes or devices do not fit.

@@ -1,4 +1,4 @@
-"""Maps in UV space: values of vertices drawn into them, and maps read at fixed places.
+"""Maps in UV space: vertex values drawn into maps, and maps sampled at fixed places.
 
 Texel (column i, row j) of a W x H map has its centre at u = (i + 0.5) / W, v = 1 - (j + 0.5) / H: row 0 is the top,
 v = 1. Both directions are sparse matrices, so their adjoints are deterministic.
@@ -16,7 +16,7 @@ from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 wp.set_module_options({"enable_backward": False})
 
 _NONE = 2**31 - 1  # larger than any face
-_EDGE = 1e-9  # a texel centre this close to an edge, as a barycentric weight, belongs to both of its faces
+_EDGE = 1e-9  # barycentric weight: a texel centre this close to an edge belongs to the faces on both sides
 
 
 @wp.func
@@ -26,7 +26,7 @@ def _cross(a: wp.vec2d, b: wp.vec2d) -> wp.float64:
 
 @wp.func
 def _barycentric(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d) -> wp.vec3d:
-    """Weights of a, b and c at ``p``; all NaN for a face without area, whichever way it faces."""
+    """Return the weights of a, b and c at ``p``, for either orientation; all NaN for a face without area."""
     area = _cross(b - a, c - a)
     w_b = _cross(p - a, c - a) / area
     w_c = _cross(b - a, p - a) / area
@@ -35,7 +35,10 @@ def _barycentric(a: wp.vec2d, b: wp.vec2d, c: wp.vec2d, p: wp.vec2d) -> wp.vec3d
 
 @wp.func
 def _texel_range(low: wp.float64, high: wp.float64, size: int) -> wp.vec2i:
-    """First and past-the-last texel whose centre may be between ``low`` and ``high`` [texels]; none if NaN."""
+    """Return the first texel whose centre may lie between ``low`` and ``high`` [texels], and one past the last.
+
+    A NaN fails the comparison and gives an empty range, so that it never becomes an index.
+    """
     end = wp.float64(size)
     if not (high >= wp.float64(0.0) and low <= end):
         return wp.vec2i(0, 0)
@@ -60,7 +63,7 @@ def _cover_kernel(
             p = wp.vec2d(wp.float64(i) + wp.float64(0.5), wp.float64(j) + wp.float64(0.5))
             weights = _barycentric(a, b, c, p)
             least = wp.float64(-_EDGE)
-            # One by one: a face without area has NaN among its weights, and a minimum may hide it.
+            # Compared one by one: a face without area has NaN weights, and a minimum of them might hide it.
             if weights[0] >= least and weights[1] >= least and weights[2] >= least:
                 wp.atomic_min(face_ids, j * width + i, f)
 
@@ -87,26 +90,26 @@ def _weights_kernel(
 
 @dataclass(frozen=True, eq=False)
 class UvMap:
-    """Which face covers each texel, and the matrix that draws per-vertex values into the map.
+    """The face that covers each texel, and the matrix that draws per-vertex values into the map.
 
     Attributes:
-        matrix: Barycentric weights of the covering face at each texel centre, zero rows where there is none, [H W, V].
-        face_ids: Face over each texel, -1 for none, shape [H, W], int32.
+        matrix: Barycentric weights of the covering face at each texel centre, [H W, V]; rows without a face are zero.
+        face_ids: Face of each texel, or -1, shape [H, W], int32.
     """
 
     matrix: SparseMatrix
     face_ids: Tensor
 
     def to(self, device: torch.device | str) -> "UvMap":
-        """The same map on another device."""
+        """Return the same map on another device."""
         return UvMap(self.matrix.to(device), self.face_ids.to(device))
 
 
 def uv_map(vt: Tensor, ft: Tensor, faces: Tensor, n_verts: int, height: int, width: int) -> UvMap:
-    """Find what covers each texel centre. Where faces overlap or meet, the one with the smallest index counts.
+    """Find the face over each texel centre; where faces overlap or meet, that with the smallest index.
 
     Args:
-        vt: Texture coordinates, v up, shape [U, 2], float32 or float64. What lies outside the unit square is cut.
+        vt: Texture coordinates, v up, shape [U, 2], float32 or float64; parts outside the unit square are cut off.
         ft: Texture indices of each face, shape [F, 3], integers.
         faces: Vertex indices of each face, shape [F, 3], integers.
         n_verts: Number of vertices V.
@@ -144,7 +147,7 @@ def uv_map(vt: Tensor, ft: Tensor, faces: Tensor, n_verts: int, height: int, wid
 
 
 def position_map(uv: UvMap, verts: Tensor) -> Tensor:
-    """Draw per-vertex values into the map, zero where no face is. Differentiable in ``verts``.
+    """Draw per-vertex values into the map; zero where there is no face. Differentiable in ``verts``.
 
     Args:
         uv: Made by :func:`uv_map`.
@@ -160,17 +163,17 @@ def position_map(uv: UvMap, verts: Tensor) -> Tensor:
 
 
 def _neighbours(at: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The two texels around each place [texels] along one axis, held inside the map, and the second one's weight."""
+    """Return the two texels around each place [texels] along one axis, clamped to the map, and the second's weight."""
     inside = torch.nan_to_num(at - 0.5, nan=0.0).clamp(0, size - 1)
     low = inside.floor().clamp(max=max(size - 2, 0))
     return low.long(), (low.long() + 1).clamp(max=size - 1), inside - low
 
 
 def uv_sampler(uv: Tensor, height: int, width: int) -> SparseMatrix:
-    """Prepare bilinear samples of maps at fixed places; beyond the outermost centres the border texel goes on.
+    """Prepare bilinear samples of maps at fixed places; border texels continue outside the map.
 
     Args:
-        uv: Places, v up, shape [N, 2], float32 or float64; NaN reads the map's first texels.
+        uv: Texture coordinates, v up, shape [N, 2], float32 or float64; NaN reads the first texels.
         height: Rows H of the maps.
         width: Columns W of the maps.
 
@@ -194,11 +197,11 @@ def uv_sampler(uv: Tensor, height: int, width: int) -> SparseMatrix:
 
 
 def sample_map(maps: Tensor, uv: Tensor, *, sampler: SparseMatrix | None = None) -> Tensor:
-    """Read maps bilinearly at UV coordinates, the border texels going on outside. Differentiable in ``maps``.
+    """Sample maps bilinearly at UV coordinates; border texels continue outside. Differentiable in ``maps``.
 
     Args:
         maps: Maps, shape [C, H, W], float32 or float64.
-        uv: Places, v up, shape [N, 2].
+        uv: Texture coordinates, v up, shape [N, 2].
         sampler: :func:`uv_sampler` of ``uv``; without it, it is prepared on every call.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The benchmark: its plain forms compute the same, its table and JSON hold what was measured."""
+"""The benchmark of the kernels: plain forms compute the same, table and JSON hold what was measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Equal bits from run to run: a race that was found, and the torch operations that one step of each stage uses."""
+"""Equal bits from run to run: the gradient of frames, and the torch operations of one step of each stage."""
 
 from __future__ import annotations
 

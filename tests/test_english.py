@@ -13,7 +13,6 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("mgavatar", "kernels", "tools")
 
 NOT_YET = (
-    "kernels",
     "mgavatar/appearance",
     "mgavatar/avatar.py",
     "mgavatar/avatar_file.py",

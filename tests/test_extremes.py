@@ -1,4 +1,4 @@
-"""Every kernel at its extremes, one row of the table a test: no row is skipped."""
+"""Every kernel at extreme inputs: each row of the table is one test, and none is skipped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Multiresolution hash features, and the optimizer that visits only what was hit."""
+"""Multiresolution hash features, and the optimizer that visits only entries with a gradient."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""What must not change the rasterizer's result, to the bit where it can be."""
+"""Changes of the input that must not change the rasterizer's result, to the bit where possible."""
 
 from __future__ import annotations
 

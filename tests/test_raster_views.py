@@ -1,4 +1,4 @@
-"""Several views in one launch: each is, to the bit, what it is alone."""
+"""Several views in one launch: each has the same bits as the view alone."""
 
 from __future__ import annotations
 

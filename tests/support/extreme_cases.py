@@ -1,4 +1,4 @@
-"""The table of extremes: what each kernel is given, and what is expected of it.
+"""The table of extremes: each kernel's extreme inputs, and the result that is expected.
 
 ``tests/test_extremes.py`` checks every row, ``tools/numerics.py`` prints it with the measured errors.
 """
