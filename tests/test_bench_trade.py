@@ -132,7 +132,7 @@ def test_what_is_emulated_has_an_effect(run):
     assert rows["extent", "ellipse"]["psnr"] > rows["extent", "3 sigma"]["psnr"] + 10
     assert rows["image scale", "1"]["psnr"] > rows["image scale", "1/2"]["psnr"] + 10
     assert rows["storage", "float16"]["ms"] is None
-    assert "another picture" in rows["low-pass", "0"]["note"]
+    assert "another image" in rows["low-pass", "0"]["note"]
 
 
 def test_both_exponentials_agree(reference):

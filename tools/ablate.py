@@ -52,10 +52,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Cell:
-    """One preset on one capture from one seed.
-
-    The properties name the places of its files.
-    """
+    """One preset on one capture from one seed."""
 
     preset: str
     data: Path
@@ -65,26 +62,32 @@ class Cell:
 
     @property
     def capture(self) -> str:
+        """Return the name of the capture."""
         return self.data.resolve().name
 
     @property
     def name(self) -> str:
+        """Return the preset as part of a path."""
         return "+".join(Path(part).stem if part.endswith(".toml") else part for part in self.preset.split(","))
 
     @property
     def folder(self) -> Path:
+        """Return the folder of the cell."""
         return self.options.out / self.capture / self.name / f"seed{self.seed}"
 
     @property
     def run(self) -> Path:
+        """Return the folder of the fit."""
         return self.folder / "run"
 
     @property
     def metrics(self) -> Path:
+        """Return the path of the scores."""
         return self.folder / "metrics.json"
 
     @property
     def summary(self) -> Path:
+        """Return the path of the fit's summary."""
         return self.run / "summary.json"
 
     def conditions(self) -> dict[str, Any]:
@@ -99,6 +102,7 @@ class Cell:
         }
 
     def fit_command(self, *, resume: bool) -> list[str]:
+        """Return the arguments of mgavatar that fit the cell."""
         o = self.options
         command = ["fit", "--data", str(self.data), "--out", str(self.run), "--preset", self.preset]
         command += ["--seed", str(self.seed), "--device", o.device]
@@ -107,6 +111,7 @@ class Cell:
         return command + (["--resume"] if resume else [])
 
     def evaluate_command(self) -> list[str]:
+        """Return the arguments of mgavatar that score the cell."""
         o = self.options
         command = ["evaluate", "--avatar", str(self.run), "--data", str(self.data), "--json", str(self.metrics)]
         return [*command, "--device", o.device, *(["--lpips-weights", str(o.lpips_weights)] if o.lpips_weights else [])]
@@ -158,7 +163,7 @@ def run_command(command: Sequence[str], log: Path) -> int:
 
 
 def complete(cell: Cell) -> str | None:
-    """Do the remaining work of a cell; return the reason if it fails."""
+    """Complete what a cell lacks; return the reason if that fails."""
     if cell.metrics.is_file() and not _lacks_lpips(cell):
         return None
     cell.folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The contact sheet of tools/ablate.py: held-out frames and meshes of several avatars beside the truth."""
+"""Contact sheet of ``tools/ablate.py``: held-out frames and meshes of several avatars beside the ground truth."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _MARGIN, _LINE, _CHARACTER = 110, 15, 7
 
 
 def contact_sheet(captures: Mapping[Path, Sequence[tuple[str, Path]]]) -> np.ndarray:
-    """Rows of held-out frames of each capture and one of surface normals: the truth, then each avatar with its PSNR.
+    """Draw held-out frames of each capture and one row of surface normals: the truth, then each avatar with its PSNR.
 
     Args:
-        captures: For the folder of each capture, titles and avatars, in the order of the columns.
+        captures: Titles and avatar files in the order of the columns, by the folder of their capture.
 
     Returns:
         Pixels [H, W, 3], uint8.
@@ -40,7 +40,7 @@ def contact_sheet(captures: Mapping[Path, Sequence[tuple[str, Path]]]) -> np.nda
 
 
 def _block(data: Path, avatars: Sequence[tuple[str, Path]]) -> np.ndarray:
-    """One capture: a line of titles, then its rows."""
+    """Draw one capture: a line of titles, then its rows."""
     loaded = Avatar.load(avatars[0][1])
     subject = read_capture(data, principal_point=loaded.config.principal_point)
     frames = [(split, frame) for split, count in _SHOWN.items() for frame in spread(subject.frames[split], count)]
@@ -70,7 +70,7 @@ def _row(label: str, panels: Sequence[np.ndarray]) -> np.ndarray:
 def _column(
     avatar: Avatar, subject: Subject, frames: Sequence[Frame], targets: Sequence[torch.Tensor], side: Frame
 ) -> list[np.ndarray]:
-    """What one avatar makes of the frames, and its mesh."""
+    """Draw the frames and the mesh of one avatar."""
     panels = []
     for frame, target in zip(frames, targets, strict=True):
         image = (
@@ -98,12 +98,12 @@ def _words(text: str, width: int, height: int) -> np.ndarray:
 
 
 def _font(height: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """Twelve pixels once the picture is reduced."""
+    """Return a font that has twelve pixels after the picture is reduced."""
     return ImageFont.load_default(12 * max(1.0, height / PANEL))
 
 
 def _stacked(parts: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures under one another on white, with gaps."""
+    """Stack pictures on white, with gaps."""
     width = max(part.shape[1] for part in parts)
     padded = [np.pad(p, ((0, 6), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in parts]
     return np.concatenate(padded)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import warp as wp
 from command_line import run
+from warp._src.context import user_modules  # Warp has no public list of its modules
 
 import mgavatar.kernels
 from mgavatar.reporting.markdown import markdown_table
@@ -88,8 +89,7 @@ def modules() -> list[wp.Module]:
     for path in sorted(folder.glob("*.py")):
         if path.stem != "__init__":
             importlib.import_module(f"mgavatar.kernels.{path.stem}")
-    known = wp._src.context.user_modules.values()
-    return [module for module in known if module.name.startswith("mgavatar.kernels") and module.kernels]
+    return [module for module in user_modules.values() if module.name.startswith("mgavatar.kernels") and module.kernels]
 
 
 def cuda_usage(*, architectures: tuple[int, ...] = (90,)) -> str:

@@ -1,7 +1,7 @@
-"""Where the time of an optimizer step goes: each part of the program timed in place, forward and backward.
+"""Time the parts of an optimizer step in place, forward and backward.
 
-Functions are wrapped for a while. What a function adds to torch's graph is timed under its name when the graph is
-walked back; a part inside another one is taken out of it, so that the parts add up to the step.
+Functions are wrapped temporarily. The nodes that a function adds to torch's graph are timed under its name in the
+backward pass. The time of a part inside another one is subtracted from the outer one, so the parts add up to the step.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
 REST = "the rest"
-"""What no part claims: torch's bookkeeping, sums of losses, the loop."""
+"""Name of the remaining time: torch's bookkeeping, sums of losses, the loop."""
 
 Parts = tuple[tuple[str, str, str], ...]
 """Module or class, attribute, name of the part."""
@@ -61,7 +61,7 @@ APPEARANCE: Parts = (
 
 
 class Profile:
-    """Seconds of each part of one step; a part inside another one counts for itself alone."""
+    """Seconds of each part of one step; a part inside another one counts once."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -72,20 +72,20 @@ class Profile:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """One step, whose times are in ``seconds`` afterwards."""
+        """Time one step; ``seconds`` has its parts afterwards."""
         self.seconds = defaultdict(float)
         self._labelled = set()
         self._running = [REST]
         self._since = self.now()
         yield
         self._leave()
-        for hook in self._hooks:  # the nodes of parameters are there in the next step too
+        for hook in self._hooks:  # nodes of parameters survive the step and would be timed twice in the next
             hook.remove()
         self._hooks = []
 
     @contextmanager
     def wrapped(self, parts: Parts) -> Iterator[None]:
-        """Time ``parts`` for a while."""
+        """Wrap the functions of ``parts`` inside the block."""
         with ExitStack() as stack:
             for place, attribute, name in parts:
                 module, _, owner_name = place.partition(":")
@@ -97,7 +97,7 @@ class Profile:
             yield
 
     def now(self) -> float:
-        """Seconds, once the device has done what it was told."""
+        """Return the clock [s] after all work on the device has finished."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return time.perf_counter()
@@ -132,7 +132,7 @@ class Profile:
         return timed
 
     def _label(self, result: Any, name: str) -> None:
-        """Time the nodes behind ``result`` under ``name`` in the backward pass, but for those that have a name."""
+        """Time the unnamed nodes behind ``result`` under ``name`` in the backward pass."""
         nodes = [tensor.grad_fn for tensor in _tensors(result)]
         while nodes:
             node = nodes.pop()
@@ -144,7 +144,7 @@ class Profile:
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
-    """All tensors in what a function returned."""
+    """Yield all tensors in the result of a function."""
     if isinstance(value, Tensor):
         yield value
     elif isinstance(value, tuple | list):

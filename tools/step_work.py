@@ -1,4 +1,4 @@
-"""What ``mgavatar bench fit`` times: both stages at three sizes, on a synthetic capture, as far along as a fit gets."""
+"""Both stages of a fit at three sizes, warmed up on a synthetic capture, for ``tools/bench_fit.py`` to time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mgavatar.presets import preset
 from mgavatar.synthetic.capture import make_synthetic_capture
 
 WARM_UP = 30
-"""Iterations of a stage before it is timed: enough for sizes and opacities to leave their start."""
+"""Iterations of a stage before it is timed: enough for sizes and opacities to leave their initial values."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +32,10 @@ class Size:
     """Amount of work.
 
     Attributes:
-        name: Preset that has about this size.
+        name: Preset of about this size.
         image: Width and height [px].
-        gaussians: Face-bound Gaussians to grow to.
-        config: The fit.
+        gaussians: Number of face-bound Gaussians to grow to.
+        config: Configuration of the fit.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Size:
 
 
 def sizes() -> Iterator[Size]:
-    """``quick``, ``balanced`` and ``paper``, without anything that a capture has to settle."""
+    """Yield ``quick``, ``balanced`` and ``paper`` with fixed values for every setting that costs time."""
     quick = preset("quick")
     paper = FitConfig()
     a = paper.appearance
@@ -67,7 +67,7 @@ class Bench:
     """Both stages of a fit that can be stepped one iteration at a time."""
 
     def __init__(self, size: Size, folder: Path, device: torch.device) -> None:
-        """Make a capture of six training images in ``folder``, and the head."""
+        """Make a capture of six training images in ``folder`` and set up the head."""
         torch.manual_seed(0)
         self.size = size
         self.device = device
@@ -81,7 +81,7 @@ class Bench:
         self.head = PersonalHead(body, subject.params, self.config.geometry)
 
     def step(self, stage: Stage, iteration: int) -> None:
-        """What the loop of a fit does with one view."""
+        """Take one optimizer step with one view, as the loop of a fit does."""
         view = iteration % len(self.views.images)
         background = self.background
         if self.views.masks is not None:
@@ -90,14 +90,14 @@ class Bench:
         stage.step(self.views.cameras[view], self.views.timesteps[view], target, background)
 
     def geometry(self) -> GeometryStage:
-        """The geometry stage after its warm-up."""
+        """Build the geometry stage and warm it up."""
         stage = GeometryStage(VertexGaussians(self.head, self.config), self.config)
         for iteration in range(WARM_UP):
             self.step(stage, iteration)
         return stage
 
     def appearance(self) -> AppearanceStage:
-        """The appearance stage after its warm-up, grown to the size's number of Gaussians."""
+        """Build the appearance stage, warm it up and grow it to the number of Gaussians of its size."""
         appearance = build_appearance(self.head, self.config, seed=0)
         stage = AppearanceStage(appearance, self.config, seed=0)
         for iteration in range(WARM_UP):
@@ -116,7 +116,7 @@ class Bench:
 
 
 def refine(stage: AppearanceStage) -> None:
-    """One event of density control."""
+    """Run one event of density control."""
     appearance = stage.appearance
     stage.density.refine(stage.optimizer, appearance.frozen.frames.scales)
     appearance.rebind()

@@ -1,4 +1,4 @@
-"""What ``mgavatar bench trade`` measures beside the rasterizer: the SSIM term and the hash grid of ColorNet."""
+"""Measurements beside the rasterizer for ``tools/bench_trade.py``: the SSIM term and the hash grid of ColorNet."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ from mgavatar.kernels.ssim import compare_images
 _C1, _C2, _SIGMA = 0.01**2, 0.03**2, 1.5
 
 LEVELS, LOG2_SIZES = (16, 8, 4), (19, 16, 14)
-"""Of the hash grid; the first is the paper's."""
+"""Levels and table sizes of the hash grid; the paper's first."""
 
 HELD_OUT = 8
-"""Every so many points are kept from the regression."""
+"""One in this many points is held out from the regression."""
 
 
 def window_ssim(image: Tensor, target: Tensor, size: int) -> Tensor:
-    """Mean SSIM with a Gaussian window of ``size`` pixels and zero padding, in plain torch; images [3, H, W]."""
+    """Compute the mean SSIM in plain torch, with a Gaussian window of ``size`` pixels and zero padding.
+
+    Images have the shape [3, H, W].
+    """
     x = torch.arange(size, dtype=image.dtype) - size // 2
     w = torch.exp(-(x**2) / (2 * _SIGMA**2))
     w = w / w.sum()
@@ -60,7 +63,7 @@ def _ssim_step(function: Callable[[Tensor, Tensor], Tensor], image: Tensor, targ
 
 
 def _interleaved(steps: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, tuple[float, float]]:
-    """Median milliseconds, and median ratio to the first, of steps that take turns."""
+    """Time steps that take turns; return the median time [ms] and the median ratio to the first of each."""
     times: dict[str, list[float]] = {name: [] for name in steps}
     for step in steps.values():
         step()
@@ -77,7 +80,7 @@ def _interleaved(steps: Mapping[str, Callable[[], object]], rounds: int) -> dict
 
 
 def ssim_rows(scene: Scene, *, rounds: int) -> list[Row]:
-    """The SSIM term between an avatar's image and the capture: window in plain torch, scale in the kernel."""
+    """Measure the SSIM term between an avatar's image and the capture: window in plain torch, scale in the kernel."""
     image = _drawn(scene).image.clamp(0.0, 1.0)
     value, exact = _ssim_step(partial(window_ssim, size=11), image.double(), scene.target.double())
     groups: dict[str, dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
@@ -107,7 +110,7 @@ def ssim_rows(scene: Scene, *, rounds: int) -> list[Row]:
 
 
 def _drawn(scene: Scene) -> Rendering:
-    """What the avatar looks like by default."""
+    """Draw a scene with the program's defaults."""
     camera = scene.camera
     viewmat, K = (torch.tensor(matrix, dtype=torch.float32) for matrix in (camera.viewmat, camera.K))
     size = (camera.width, camera.height)
@@ -115,16 +118,19 @@ def _drawn(scene: Scene) -> Rendering:
 
 
 def canonical_positions(avatar: Avatar) -> Tensor:
-    """Where ColorNet is asked for colours [m], shape [N, 3]."""
+    """Return the positions at which ColorNet is evaluated [m], shape [N, 3]."""
     if avatar.appearance is None:
         return avatar.head.canonical().detach()
     return avatar.appearance.gaussians.canonical_means(avatar.appearance.frozen.frames)
 
 
 def seen_colors(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor]:
-    """What the capture shows at each Gaussian: mean colour [N, 3] over the views, and which are seen at all, [N].
+    """Look up the captured colour of each Gaussian.
 
     A Gaussian is seen where it lies at most 1 % of its distance behind the drawn surface.
+
+    Returns:
+        Mean colour over the views that see a Gaussian, shape [N, 3], and True where any view does, shape [N].
     """
     n = len(scenes[0].gaussians[0])
     total, count = torch.zeros(n, 3), torch.zeros(n)
@@ -159,7 +165,7 @@ class _Regression:
         self.directions = torch.zeros_like(self.points)
 
     def step(self) -> None:
-        """Forward, backward and both optimizers."""
+        """Take one step of both optimizers."""
         error = functional.mse_loss(self.net(self.points, self.directions), self.colors)
         self.optimizer.zero_grad(set_to_none=True)
         error.backward()
@@ -168,7 +174,7 @@ class _Regression:
 
     @torch.no_grad()
     def scores(self) -> tuple[float, float, float]:
-        """PSNR [dB] and largest error of the points learned, PSNR of those held out."""
+        """Return PSNR [dB] and largest error of the learned points, and PSNR of those held out."""
         fitted = self.net(self.points, self.directions)
         others = self.net(self.held_points, torch.zeros_like(self.held_points))
         worst = float((fitted - self.colors).abs().max())
@@ -176,12 +182,12 @@ class _Regression:
 
 
 def hash_rows(avatar: Avatar, scenes: Sequence[Scene], *, steps: int) -> list[Row]:
-    """Hash levels and table size: time of a step, and how well ColorNet learns the capture's colours in a few steps.
+    """Measure levels and table size of the hash grid: time of a step, and colours that ColorNet learns in a few steps.
 
-    Colours are the capture's at the canonical positions of the Gaussians that some scene shows.
+    The colours are those of the capture at the canonical positions of the Gaussians that a scene shows.
     """
     colors, seen = seen_colors(scenes)
-    if not bool(seen.any()):  # nothing covers a pixel: then any colours do
+    if not bool(seen.any()):  # no Gaussian covers a pixel: any colours serve to time the grid
         colors, seen = scenes[0].gaussians[4].clamp(0.0, 1.0), torch.ones_like(seen)
     points = canonical_positions(avatar)[seen]
     paper = ColorNetConfig()

@@ -1,7 +1,7 @@
-"""What ``mgavatar bench trade`` measures of the rasterizer: each knob alone, against the exact image and gradient.
+"""Measurements of the rasterizer for ``tools/bench_trade.py``: each knob alone, against the exact image and gradient.
 
-Exact is the plain form in float64 without a stop, and with contributions down to an alpha of 1e-12; that a lower
-threshold changes nothing is measured as well.
+Exact is the plain form in float64 without a stop and with contributions down to an alpha of 1e-12. ``Reference``
+measures that a lower threshold changes nothing.
 """
 
 from __future__ import annotations
@@ -29,38 +29,38 @@ from mgavatar.kernels.rasterize import RasterSettings, Work, rasterize
 from mgavatar.scoring.evaluate import evaluation_pose
 
 GRADIENTS = ("means", "quats", "scales", "opacities", "colors")
-"""What a step differentiates, in the rasterizer's order."""
+"""Inputs that a step differentiates, in the rasterizer's order."""
 
 EXACT = RasterSettings(alpha_threshold=1e-12, stop=0.0, form="plain")
-"""Run in float64."""
+"""Settings of the exact image; run in float64."""
 
 NEARLY_EXACT = RasterSettings(alpha_threshold=1e-8, stop=0.0)
-"""In single precision: what is left out is below its rounding. The other knobs stand here while one is scored."""
+"""Settings whose omissions are below the rounding of single precision. Other knobs have them while one is scored."""
 
 BALANCED = RasterSettings()
-"""The other knobs stand here while one is timed."""
+"""The program's defaults. Other knobs have them while one is timed."""
 
 SLOW_SIZE = 64
-"""Longer side of the image where a value would take minutes otherwise [px]."""
+"""Longer side of the image for values that would otherwise take minutes [px]."""
 
 PSNR_LIMIT = 300.0
-"""Of equal images [dB]."""
+"""PSNR of equal images [dB]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One line of the table; what does not apply is None.
+    """One row of the table; a value that does not apply is None.
 
     Attributes:
-        knob: What was changed.
-        value: To what.
-        default: Whether the program does so when nobody says otherwise.
-        ms: Median time of a forward and a backward pass.
+        knob: Name of the changed knob.
+        value: Its value, as the table shows it.
+        default: True if this is the program's default.
+        ms: Median time of a forward and a backward pass [ms].
         ratio: Median of its time over the default's in the same round.
-        psnr: To the exact image [dB].
-        worst: Largest error of a pixel's channel.
-        gradient: Relative L2 error of the gradient by what it belongs to.
-        note: What else one must know.
+        psnr: PSNR against the exact image [dB].
+        worst: Largest error of a channel of a pixel.
+        gradient: Relative L2 error of the gradient, per input.
+        note: Remarks.
     """
 
     knob: str
@@ -79,10 +79,10 @@ class Scene:
     """A training view of the avatar.
 
     Attributes:
-        gaussians: In the rasterizer's order, float32.
-        camera: Where from.
-        target: The captured image in 0..1, shape [3, H, W].
-        background: RGB, shape [3].
+        gaussians: Tensors in the rasterizer's order, float32.
+        camera: Camera of the view.
+        target: Captured image in 0..1, shape [3, H, W].
+        background: RGB in 0..1, shape [3].
     """
 
     gaussians: tuple[Tensor, ...]
@@ -96,9 +96,9 @@ class Step:
     """A forward and a backward pass of the mean squared error against the capture.
 
     Attributes:
-        image: Shape [3, H, W].
-        gradients: By ``GRADIENTS``.
-        seconds: Both passes.
+        image: Drawn image, shape [3, H, W].
+        gradients: Gradients in the order of ``GRADIENTS``.
+        seconds: Time of both passes [s].
     """
 
     image: Tensor
@@ -112,16 +112,16 @@ class Setting:
 
     Attributes:
         knob: Name of the knob.
-        value: As the table shows it.
-        timed: Settings of the timing: everything else is balanced.
-        scored: Settings of the comparison: everything else is nearly exact.
-        dtype: Of all arrays.
-        edit: Changes the splats between projection and blending, for what the kernels do not offer.
-        image_scale: Of both sides of the image.
-        default: Whether it is the program's.
-        slow: Run once, on the first view, which is reduced to ``SLOW_SIZE``.
-        has_time: Whether the time means anything.
-        note: For the table.
+        value: Its value, as the table shows it.
+        timed: Settings for the timing: all other knobs are balanced.
+        scored: Settings for the comparison: all other knobs are nearly exact.
+        dtype: Type of all arrays.
+        edit: Change of the splats between projection and blending, for values that the kernels do not offer.
+        image_scale: Factor on both sides of the image.
+        default: True if this is the program's default.
+        slow: True to run it once, on the first view reduced to ``SLOW_SIZE``.
+        has_time: False if the time is meaningless, because the value is only emulated.
+        note: Remark for the table.
     """
 
     knob: str
@@ -138,7 +138,7 @@ class Setting:
 
 
 def scenes_of(avatar: Avatar, subject: Subject, *, views: int, max_image_size: int) -> list[Scene]:
-    """Evenly spaced training views, reduced until their longer side has at most ``max_image_size`` pixels.
+    """Return evenly spaced training views, reduced until their longer side has at most ``max_image_size`` pixels.
 
     Raises:
         DataError: If the capture lacks training views, or images cannot be read.
@@ -161,7 +161,7 @@ def scenes_of(avatar: Avatar, subject: Subject, *, views: int, max_image_size: i
 
 
 def reduced(scene: Scene, max_image_size: int) -> Scene:
-    """A scene whose longer side has at most ``max_image_size`` pixels."""
+    """Return a scene reduced until its longer side has at most ``max_image_size`` pixels."""
     camera = scene.camera
     shrink = min(1.0, max_image_size / max(camera.width, camera.height))
     width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
@@ -170,7 +170,7 @@ def reduced(scene: Scene, max_image_size: int) -> Scene:
 
 
 def run_step(scene: Scene, settings: RasterSettings, setting: Setting | None = None) -> Step:
-    """Draw a scene and differentiate it, with what ``setting`` says about types, splats and size."""
+    """Draw a scene and differentiate it, with the type, splats and size of ``setting``."""
     dtype = torch.float64 if setting is None else setting.dtype
     scale = 1.0 if setting is None else setting.image_scale
     size = (max(1, round(scene.camera.width * scale)), max(1, round(scene.camera.height * scale)))
@@ -179,7 +179,7 @@ def run_step(scene: Scene, settings: RasterSettings, setting: Setting | None = N
     if target.shape[1:] != size[::-1]:
         target = torch.nn.functional.interpolate(target[None], size=size[::-1], mode="area")[0]
     leaves = [tensor.to(dtype, copy=True).requires_grad_() for tensor in scene.gaussians]
-    # Rounded like the rest: otherwise float64 would order Gaussians by the depths of another camera.
+    # Cameras are rounded to float32 like the Gaussians: otherwise float64 would sort by the depths of another camera.
     viewmat, K = (torch.tensor(matrix, dtype=torch.float32).to(dtype) for matrix in (camera.viewmat, camera.K))
     background = scene.background.to(dtype)
     with _edited_splats(setting.edit if setting is not None else None):
@@ -196,7 +196,7 @@ def _gradient(leaf: Tensor) -> Tensor:
 
 @contextmanager
 def _edited_splats(edit: Callable[[Tensor], None] | None) -> Iterator[None]:
-    """Let ``edit`` change the splats between projection and blending, for what no setting of the op offers."""
+    """Apply ``edit`` to the splats between projection and blending, for values that no setting of the op offers."""
     project = raster.project
 
     def edited(
@@ -218,13 +218,13 @@ def _edited_splats(edit: Callable[[Tensor], None] | None) -> Iterator[None]:
 
 
 def psnr(image: Tensor, exact: Tensor) -> float:
-    """Peak 1 [dB], at most ``PSNR_LIMIT``."""
+    """Return the PSNR for a peak of 1 [dB], at most ``PSNR_LIMIT``."""
     error = float((image.double() - exact.double()).square().mean())
     return min(PSNR_LIMIT, -10.0 * math.log10(max(error, 1e-300)))
 
 
 def _like(image: Tensor, exact: Tensor) -> Tensor:
-    """A reduced image at the exact one's size."""
+    """Resize a reduced image to the size of the exact one."""
     if image.shape == exact.shape:
         return image
     size = tuple(exact.shape[1:])
@@ -232,13 +232,14 @@ def _like(image: Tensor, exact: Tensor) -> Tensor:
 
 
 def _three_sigma(splats: Tensor) -> None:
+    """Cut each ellipse at 3 sigma: column 12 is its squared reach, column 13 half its height in pixels."""
     drawn = splats[:, 6] > 0
     splats[:, 12] = torch.where(drawn, 9.0, splats[:, 12])
     splats[:, 13] = torch.where(drawn, 3.0 * splats[:, 6].rsqrt() + 0.01, splats[:, 13])
 
 
 def _half_precision(splats: Tensor) -> None:
-    """Round what is blended; the bounds of an ellipse (reach, half height, radius) stay as they are."""
+    """Round the columns that are blended, but not the bounds of an ellipse (reach, half height, radius)."""
     splats[:, :12] = splats[:, :12].half().float()
 
 
@@ -255,7 +256,7 @@ def _level(name: str, thresholds: tuple[float, float]) -> Setting:
 
 
 def fraction(value: float) -> str:
-    """1/255 instead of 0.00392157, 1e-4 instead of 1/10000."""
+    """Write a threshold as the table does: 1/255 instead of 0.00392157, 1e-4 instead of 1/10000."""
     if value <= 0.0 or value > 1.0 / 16.0:
         return f"{value:g}"
     power = round(math.log10(value))
@@ -283,7 +284,7 @@ def _emulated(knob: str, value: str, note: str, **changes: Any) -> Setting:
 
 
 def raster_knobs() -> list[list[Setting]]:
-    """Every knob of the rasterizer with its values; each has one default, which its times are compared with."""
+    """List every knob of the rasterizer with its values; times are compared with the one default of each knob."""
     rounded = "splats rounded between projection and blending; the kernels have no such form, so no time"
     reduced_note = "image enlarged again; gradient of the reduced image's error"
     return [
@@ -307,21 +308,24 @@ def raster_knobs() -> list[list[Setting]]:
 
 
 class Reference:
-    """Exact steps of the scenes, made when they are asked for and kept."""
+    """Exact steps of the scenes, computed on demand and kept."""
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         self.scenes = scenes
         self._steps: dict[tuple[int, float], Step] = {}
 
     def step(self, view: int, low_pass: float) -> Step:
-        """The exact image and gradient of a view."""
+        """Return the exact image and gradient of a view."""
         key = (view, low_pass)
         if key not in self._steps:
             self._steps[key] = run_step(self.scenes[view], replace(EXACT, low_pass=low_pass))
         return self._steps[key]
 
     def remainder(self, side: int = 16) -> float:
-        """Largest change of a pixel without any threshold, in the middle of the first view, which is slow."""
+        """Measure the largest change of a pixel without any threshold.
+
+        It is slow, so it looks at the ``side`` x ``side`` pixels in the middle of the first view.
+        """
         scene = self.scenes[0]
         camera = scene.camera
         width, height = min(side, camera.width), min(side, camera.height)
@@ -360,7 +364,10 @@ def _score(steps: Sequence[Step], exact: Sequence[Step]) -> _Score:
 
 
 def _times(knob: Sequence[Setting], scenes: Sequence[Scene], rounds: int) -> dict[str, tuple[float, float]]:
-    """Median milliseconds and median ratio to the default, round by round: a slow moment meets all values."""
+    """Return the median time [ms] and the median ratio to the default of each value.
+
+    The values take turns, so that a slow moment of the machine slows all of them.
+    """
     quick = [setting for setting in knob if not setting.slow and setting.has_time]
     base = next(setting for setting in knob if setting.default)
     seconds: dict[str, list[float]] = {setting.value: [] for setting in quick}
@@ -402,7 +409,7 @@ def _slow_row(setting: Setting, base: Setting, scene: Scene) -> Row:
 
 
 def measure_knob(knob: Sequence[Setting], reference: Reference, *, rounds: int) -> list[Row]:
-    """Rows of one knob: times with everything else balanced, errors with everything else nearly exact."""
+    """Measure one knob: times with all others balanced, errors with all others nearly exact."""
     times = _times(knob, reference.scenes, rounds)
     base = next(setting for setting in knob if setting.default)
     rows = []
@@ -411,14 +418,14 @@ def measure_knob(knob: Sequence[Setting], reference: Reference, *, rounds: int) 
             rows.append(_slow_row(setting, base, reference.scenes[0]))
             continue
         low_pass, usual = setting.scored.low_pass, BALANCED.low_pass
-        # Another low-pass has an exact image of its own, which takes its time.
+        # Each low-pass has its own exact image, which is slow: other values than the default use one view.
         views = range(len(reference.scenes) if low_pass == usual else 1)
         steps = [run_step(reference.scenes[view], setting.scored, setting) for view in views]
         score = _score(steps, [reference.step(view, low_pass) for view in views])
         note = ""
         if low_pass != usual:
             other = psnr(reference.step(0, low_pass).image, reference.step(0, usual).image)
-            note = f"another picture: {other:.1f} dB from that of {usual:g}"
+            note = f"another image: {other:.1f} dB from that of {usual:g}"
         ms, ratio = times.get(setting.value, (None, None))
         rows.append(_row(setting, score, ms=ms, ratio=ratio, note=note))
     return rows

@@ -32,12 +32,12 @@ from mgavatar.kernels.rasterize import RasterSettings
 from mgavatar.reporting.markdown import markdown_table
 
 ROUNDS, REPEATS = 3, 3
-"""Each round times the kernel a few times and its plain form once, so that a slow moment meets both."""
+"""Each round times the kernel a few times and its plain form once, so that a slow moment slows both."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One line of the table; times are medians [ms]."""
+    """One row of the table; times are medians [ms]."""
 
     name: str
     work: str
@@ -45,14 +45,14 @@ class Row:
     forward_ms: float
     backward_ms: float
     spread: float
-    """Half the distance between the quartiles of forward + backward, over its median."""
+    """Half the interquartile range of forward + backward over its median."""
     floor_ms: float
     plain_ms: float
-    """Plain form, forward + backward."""
+    """Time of the plain form, forward + backward."""
 
     @property
     def total_ms(self) -> float:
-        """Forward + backward."""
+        """Return the time of forward + backward."""
         return self.forward_ms + self.backward_ms
 
 

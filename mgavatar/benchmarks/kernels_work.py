@@ -1,7 +1,7 @@
-"""What ``mgavatar bench kernels`` times: each kernel on a stated amount of work, its plain form, and its floor.
+"""Jobs of ``mgavatar bench kernels``: each kernel on a stated amount of work, its plain form and its floor.
 
-A plain form computes the same values the obvious way: one thread a pixel in 16 x 16 tiles for the rasterizer, a launch
-for each of several views, torch or kornia for the rest.
+A plain form computes the same values in the obvious way: one thread per pixel in 16 x 16 tiles for the rasterizer, one
+launch per view for several views, torch or kornia for the rest.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from mgavatar.kernels.rasterize import RasterSettings, blend, blend_backward, pr
 from mgavatar.kernels.ssim import compare_images
 
 Step = Callable[[], Callable[[], object]]
-"""Runs a forward pass and returns what runs its backward pass."""
+"""Function that runs a forward pass and returns the function of its backward pass."""
 
 RASTER_OPERATIONS = (26, 62)
-"""Multiply-adds for each pixel inside an ellipse, forward and backward, as counted from the formulas."""
+"""Multiply-adds per pixel inside an ellipse, forward and backward, as counted from the formulas."""
 
 SSIM_OPERATIONS = (5 * 22 + 20, 3 * 22 + 20)
-"""For each value of the image: a separable window of 11 over five maps forward and three backward."""
+"""Multiply-adds per value of the image: a separable window of 11 over five maps forward and three backward."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +37,12 @@ class Job:
     """One row of the table.
 
     Attributes:
-        name: Kernel.
-        work: What it works on.
-        step: The kernel.
-        plain: Its plain form.
-        operations: Multiply-adds that cannot be avoided, both directions together.
-        bytes: Bytes that cannot be avoided, both directions together.
+        name: Name of the kernel.
+        work: Amount of work, for the table.
+        step: One pass of the kernel.
+        plain: One pass of its plain form.
+        operations: Unavoidable multiply-adds, both directions together.
+        bytes: Unavoidable bytes, both directions together.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Job:
     bytes: float = 0.0
 
     def floor(self, machine: Machine) -> float:
-        """Least time that the work can take on ``machine`` [s]."""
+        """Return the least time that the work can take on ``machine`` [s]."""
         return max(self.operations / machine.operations, self.bytes / machine.bytes)
 
 
@@ -78,13 +78,13 @@ class RasterScene:
     size: tuple[int, int]
 
     def loss(self, settings: RasterSettings) -> Tensor:
-        """Sum of the squared image."""
+        """Draw the scene and return the sum of the squared image."""
         out = rasterize(*self.gaussians, viewmat=self.viewmat, K=self.K, size=self.size, settings=settings)
         return out.image.square().sum()
 
 
 def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> RasterScene:
-    """The benchmark's scene: ``n`` Gaussians whose sizes cover the ellipsoid whatever ``n`` is, seen from 3.6 m."""
+    """Return ``n`` Gaussians on an ellipsoid, seen from 3.6 m; their sizes cover it for every ``n``."""
     g = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
     scales = math.sqrt(4 * math.pi * 0.75 / n) * (0.6 + 0.4 * torch.rand(n, 3, generator=g))
@@ -103,7 +103,7 @@ def head_scene(n: int, size: tuple[int, int], device: torch.device, *, opaque: b
 
 
 def _ellipse_pixels(scene: RasterScene) -> float:
-    """Pixels inside all ellipses where alpha reaches the threshold, hidden or not."""
+    """Count the pixels inside all ellipses on which alpha reaches the threshold, hidden or not."""
     background = scene.viewmat.new_zeros(3)
     detached = tuple(tensor.detach() for tensor in scene.gaussians)
     splats = project(RasterSettings(), scene.size, (*detached, scene.viewmat, scene.K, background)).splats.double()
@@ -112,7 +112,7 @@ def _ellipse_pixels(scene: RasterScene) -> float:
 
 
 def raster_job(name: str, n: int, size: tuple[int, int], device: torch.device, *, opaque: bool = False) -> Job:
-    """Projection to image and back."""
+    """Return the rasterizer from projection to image and back."""
     return _scene_job(name, head_scene(n, size, device, opaque=opaque))
 
 
@@ -131,10 +131,10 @@ def _work_of(scene: RasterScene) -> str:
 
 
 def avatar_job(path: Path, device: torch.device) -> Job:
-    """A fitted avatar in its mean pose, from the camera in the middle of those it was fitted to.
+    """Return a fitted avatar in its mean pose, seen from the middle one of its training cameras.
 
     Raises:
-        DataError: If ``path`` holds no avatar.
+        DataError: If ``path`` is not an avatar.
     """
     avatar = Avatar.load(path, device=device)
     camera = avatar.capture.mean_camera()
@@ -148,7 +148,7 @@ def avatar_job(path: Path, device: torch.device) -> Job:
 
 
 def views_job(n: int, size: tuple[int, int], device: torch.device, *, n_views: int = 4) -> Job:
-    """The head from all around in one launch; plain: one launch a view."""
+    """Return several views around the head in one launch; the plain form launches each view."""
     scene = head_scene(n, size, device)
     viewmats = scene.viewmat.repeat(n_views, 1, 1)
     for viewmat, angle in zip(viewmats, torch.linspace(0, 2 * math.pi, n_views + 1)[:-1], strict=True):
@@ -171,7 +171,7 @@ def views_job(n: int, size: tuple[int, int], device: torch.device, *, n_views: i
 
 
 def blending_step(n: int, size: tuple[int, int], device: torch.device) -> Step:
-    """The blending alone, of the same scene: its share of the time is what projection, sort and lists leave."""
+    """Return the blending alone, of the same scene, to measure its share of the time."""
     scene = head_scene(n, size, device)
     background = scene.viewmat.new_zeros(3)
     settings = RasterSettings()
@@ -185,7 +185,7 @@ def blending_step(n: int, size: tuple[int, int], device: torch.device) -> Step:
 
 
 def lbs_job(device: torch.device, n_verts: int = 20_000, n_dirs: int = 400) -> Job:
-    """Blend shapes and skinning; the floor reads every direction once in each direction."""
+    """Return blend shapes and skinning; the floor reads every direction once per pass."""
     template = _random(n_verts, 3).to(device).requires_grad_()
     dirs = _random(n_dirs, n_verts, 3, seed=1).to(device)
     coeffs = _random(n_dirs, seed=2).to(device).requires_grad_()
@@ -227,7 +227,10 @@ def _torch_hash(points: Tensor, table: Tensor, levels: list[list[int]]) -> Tenso
 
 
 def hash_grid_job(device: torch.device, n: int = 40_000, *, log2_table_size: int = 19) -> Job:
-    """Features of points and an optimizer step; plain: torch's indexing with its Adam over the whole table."""
+    """Return features of points with an optimizer step.
+
+    The plain form is torch's indexing with its Adam over the whole table.
+    """
     grid = HashGrid(HashGridShape(log2_table_size=log2_table_size)).to(device)
     points = torch.rand(n, 3, generator=torch.Generator().manual_seed(0)).to(device)
     table = grid.table.detach().clone().requires_grad_()
@@ -264,7 +267,7 @@ def hash_grid_job(device: torch.device, n: int = 40_000, *, log2_table_size: int
 
 
 def ssim_job(device: torch.device, side: int = 512) -> Job:
-    """SSIM and mean absolute error of an RGB image."""
+    """Return SSIM and mean absolute error of an RGB image."""
     image = torch.rand(3, side, side, generator=torch.Generator().manual_seed(0)).to(device).requires_grad_()
     target = torch.rand(3, side, side, generator=torch.Generator().manual_seed(1)).to(device)
 
@@ -281,7 +284,7 @@ def ssim_job(device: torch.device, side: int = 512) -> Job:
 
 
 def _sheet(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
-    """A curved sheet of (rows + 1)(columns + 1) vertices: positions, faces, UV."""
+    """Return positions, faces and UV of a curved sheet of (rows + 1)(columns + 1) vertices."""
     v, u = torch.meshgrid(torch.linspace(0, 1, rows + 1), torch.linspace(0, 1, columns + 1), indexing="ij")
     uv = torch.stack([u, v], 2).reshape(-1, 2)
     verts = torch.cat([uv, 0.1 * torch.sin(7 * uv.sum(1, keepdim=True))], 1)
@@ -292,7 +295,7 @@ def _sheet(rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def mesh_jobs(device: torch.device) -> Iterator[Job]:
-    """Laplacian, binding and UV map on a sheet of 20K vertices and 40K faces."""
+    """Yield Laplacian, binding and UV map on a sheet of 20K vertices and 40K faces."""
     points, faces, uv = (tensor.to(device) for tensor in _sheet(100, 200))
     verts = points.requires_grad_()
     n_verts = len(verts)
@@ -321,7 +324,7 @@ def _sum_of_squares(*tensors: Tensor) -> Tensor:
 
 
 def _binding_jobs(verts: Tensor, faces: Tensor) -> Iterator[Job]:
-    """Frames of the faces, and Gaussians carried into them; once the mesh is frozen, only the second has an adjoint."""
+    """Yield frames of the faces and Gaussians bound to them; on a frozen mesh only the second needs its adjoint."""
     n = len(faces)
     index = faces.long()
     order = face_frames.gather_matrix(faces, len(verts))
@@ -389,7 +392,7 @@ def _uv_job(verts: Tensor, faces: Tensor, uv: Tensor, side: int = 256) -> Job:
 
 
 def jobs(device: torch.device, avatar: Path | None = None) -> Iterator[Job]:
-    """All rows of the table, made one at a time; ``avatar`` is a fitted one's file, if there is one."""
+    """Yield the rows of the table one at a time; ``avatar`` is the file of a fitted avatar to add."""
     yield raster_job("rasterize", 20_000, (512, 512), device)
     yield raster_job("rasterize", 100_000, (802, 550), device)
     yield raster_job("rasterize, opaque", 20_000, (512, 512), device, opaque=True)

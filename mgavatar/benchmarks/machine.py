@@ -19,14 +19,14 @@ from mgavatar.kernels import bridge
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """Speed of the machine, measured in the same run: multiply-adds and bytes read a second."""
+    """Speed of the machine, measured in the same run: multiply-adds and bytes read per second."""
 
     operations: float
     bytes: float
 
 
 def calibrate(device: torch.device) -> Machine:
-    """Measure the machine: a matrix product that stays in the caches, and a sum over more than they hold."""
+    """Measure the machine with a matrix product that stays in the caches and a sum over more than they hold."""
     n = 768 if device.type == "cpu" else 8192
     a = torch.rand(n, n, device=device)
     out = torch.empty_like(a)
@@ -38,7 +38,7 @@ def calibrate(device: torch.device) -> Machine:
 
 
 def median_of(function: Callable[[], object], repeats: int, device: torch.device) -> float:
-    """Seconds of a call, after one that warms up."""
+    """Return the median time of a call [s], after one that warms up."""
     function()
     times = []
     for _ in range(repeats):
@@ -49,7 +49,7 @@ def median_of(function: Callable[[], object], repeats: int, device: torch.device
 
 
 def now(device: torch.device) -> float:
-    """Seconds, once everything that was launched on the device is done."""
+    """Return the clock [s] after all work on the device has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
@@ -57,7 +57,7 @@ def now(device: torch.device) -> float:
 
 @contextmanager
 def thread_limit(n: int) -> Iterator[None]:
-    """Let kernels and torch use ``n`` CPU threads for a while."""
+    """Let kernels and torch use ``n`` CPU threads inside the block."""
     before = bridge.num_threads(), torch.get_num_threads()
     bridge.set_num_threads(n)
     torch.set_num_threads(n)
@@ -69,7 +69,7 @@ def thread_limit(n: int) -> Iterator[None]:
 
 
 def device_name(device: torch.device) -> str:
-    """Model of the GPU, or of the processor with its number of cores."""
+    """Return the model of the GPU, or of the processor with its number of cores."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     model = platform.processor() or platform.machine()
@@ -85,7 +85,7 @@ def device_name(device: torch.device) -> str:
 
 
 def commit_of_checkout() -> str | None:
-    """The commit that runs, where the program runs from a checkout with git."""
+    """Return the current commit if the program runs from a checkout with git."""
     folder = Path(__file__).resolve().parents[2]
     if not (folder / ".git").exists():
         return None
