@@ -15,7 +15,7 @@ from trade_raster import BALANCED, Row, Scene, psnr
 
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.avatar import Avatar
-from mgavatar.config import ColorNetConfig
+from mgavatar.config import ColorNetConfig, ResolvedColorNetConfig
 from mgavatar.kernels.rasterize import Rendering, rasterize
 from mgavatar.kernels.ssim import compare_images
 
@@ -152,7 +152,7 @@ def seen_colors(scenes: Sequence[Scene]) -> tuple[Tensor, Tensor]:
 class _Regression:
     """A ColorNet that learns the colours of points, without view directions."""
 
-    def __init__(self, points: Tensor, colors: Tensor, config: ColorNetConfig) -> None:
+    def __init__(self, points: Tensor, colors: Tensor, config: ResolvedColorNetConfig) -> None:
         low, high = points.min(0).values, points.max(0).values
         margin = 0.05 * (high - low)
         torch.manual_seed(0)
@@ -190,7 +190,7 @@ def hash_rows(avatar: Avatar, scenes: Sequence[Scene], *, steps: int) -> list[Ro
     if not bool(seen.any()):  # no Gaussian covers a pixel: any colours serve to time the grid
         colors, seen = scenes[0].gaussians[4].clamp(0.0, 1.0), torch.ones_like(seen)
     points = canonical_positions(avatar)[seen]
-    paper = ColorNetConfig()
+    paper = ResolvedColorNetConfig(**vars(ColorNetConfig()))
     configs = {("hash levels", str(n)): replace(paper, levels=n) for n in LEVELS}
     configs |= {("hash table", f"2^{n}"): replace(paper, log2_table_size=n) for n in LOG2_SIZES}
     distinct = list(dict.fromkeys(configs.values()))
