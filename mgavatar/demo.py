@@ -16,7 +16,7 @@ from mgavatar.device import find_device
 from mgavatar.driving.motion import read_driving
 from mgavatar.driving.render import render
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write
+from mgavatar.files import atomic_write, make_folder, require_new_folder
 from mgavatar.head.procedural.build import build_head
 from mgavatar.pipeline import check_seed, fit
 from mgavatar.progress import FitReporter, Reporter
@@ -41,14 +41,13 @@ def run_demo(out: Path, config: FitConfig, *, device: str, seed: int) -> dict[st
         The scores, as :func:`mgavatar.evaluate` returns them.
 
     Raises:
-        DataError: If ``out`` exists and is not empty, or the fit was stopped.
+        DataError: If ``out`` exists and is not empty, or cannot be made, or the fit was stopped.
     """
     check_seed(seed)
     check(config)
     find_device(device)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DataError(f"{out}: exists; give --out a new folder")
-    out.mkdir(parents=True, exist_ok=True)
+    require_new_folder(out)
+    make_folder(out)
     head = build_head()
     with Reporter("capture", 16 * 12) as reporter:
         make_synthetic_capture(out / "capture", seed=seed, head=head, progress=lambda done, _: reporter.update(done))

@@ -1,17 +1,24 @@
-"""Reading files that strangers made, and writing files that are either whole or absent."""
+"""Reading files that strangers made, and writing files that are whole or absent.
+
+Every file that the program writes goes through ``atomic_write`` or a function below it: a refusal of the system becomes
+one ``DataError`` with the path and a remedy, whatever exception a library makes of it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import json
 import math
 import os
+import tempfile
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import IO, Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -20,10 +27,11 @@ from mgavatar.errors import DataError
 GIBIBYTE = 1 << 30
 NPZ_KINDS = "biufUS"
 """Kinds of numpy types that hold plain values: no objects, no records."""
+_PROBE_BYTES = 4096
 
 
 def one_line(text: object, *, limit: int = 200) -> str:
-    """What a file or a library said, made fit for a message of one line."""
+    """Return the text of a file or a library on one line, without control characters, at most ``limit`` long."""
     plain = "".join(char if char.isprintable() else " " for char in str(text))
     plain = " ".join(plain.split())
     return plain if len(plain) <= limit else plain[: limit - 1] + "…"
@@ -39,7 +47,11 @@ def existing_file(path: Path) -> Path:
 
 
 def read_bytes(path: Path, *, max_bytes: int) -> bytes:
-    """The whole of a file that is at most ``max_bytes`` long."""
+    """Return the contents of a file that is at most ``max_bytes`` long.
+
+    Raises:
+        DataError: If the file is missing, longer, or cannot be read.
+    """
     existing_file(path)
     try:
         with path.open("rb") as file:
@@ -52,7 +64,11 @@ def read_bytes(path: Path, *, max_bytes: int) -> bytes:
 
 
 def read_json(path: Path, *, max_bytes: int = GIBIBYTE // 4) -> Any:
-    """The value of a JSON file. Python's reader lets NaN and infinity through: check the numbers that are used."""
+    """Return the value of a JSON file. Python's reader lets NaN and infinity through: check the numbers that are used.
+
+    Raises:
+        DataError: If the file is missing, too long, or not JSON.
+    """
     data = read_bytes(path, max_bytes=max_bytes)
     try:
         return json.loads(data)
@@ -62,7 +78,7 @@ def read_json(path: Path, *, max_bytes: int = GIBIBYTE // 4) -> Any:
 
 @dataclass(frozen=True)
 class NpzContent:
-    """What ``read_npz`` found: the wanted arrays (read-only), and the names of the others."""
+    """Contents of an ``.npz`` file: the wanted arrays (read-only), and the names of the others."""
 
     arrays: dict[str, np.ndarray]
     ignored: tuple[str, ...]
@@ -144,7 +160,15 @@ def _npy_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, header: _NpyHead
 
 
 def float_array(value: np.ndarray, *, where: str) -> np.ndarray:
-    """``value`` as finite float32, contiguous; ``where`` begins the message if it is something else."""
+    """Return ``value`` as contiguous float32.
+
+    Args:
+        value: Numbers.
+        where: Begins the message: the file and the entry of it that is read.
+
+    Raises:
+        DataError: If ``value`` holds no numbers, or NaN or infinity.
+    """
     if value.dtype.kind not in "biuf":
         raise DataError(f"{where} holds {value.dtype}, numbers are needed")
     with np.errstate(over="ignore", invalid="ignore"):
@@ -156,7 +180,7 @@ def float_array(value: np.ndarray, *, where: str) -> np.ndarray:
 
 
 def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path:
-    """The existing file that a capture names, if it lies below ``allowed``.
+    """Return the existing file that a capture names, if it lies below ``allowed``.
 
     Args:
         entry: What the capture's file says: a relative path.
@@ -193,27 +217,211 @@ def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path
     return found
 
 
+class _RecordingFile(io.RawIOBase):
+    """A file that remembers the first error of a write.
+
+    Libraries turn a failed write into exceptions of their own: ``torch.save`` raises a RuntimeError of its zip writer,
+    Pillow an "encoder error". The system's reason is here. There is no ``fileno``, so nobody writes past this class.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.raw = io.FileIO(path, "xb")
+        self.error: OSError | None = None
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        try:
+            return self.raw.write(data)
+        except OSError as error:
+            self.error = self.error or error
+            raise
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self.raw.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self.raw.tell()
+
+    def sync(self) -> None:
+        """Wait until the bytes are on the disk, where delayed allocation may still find no room for them."""
+        try:
+            os.fsync(self.raw.fileno())
+        except OSError as error:
+            self.error = self.error or error
+            raise
+
+    def close(self) -> None:
+        self.raw.close()
+        super().close()
+
+
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """A file to write to that takes its name, and its predecessor's place, only when the block ends without error.
+    """Yield a file that replaces ``path`` only when the block ends without an error; otherwise it is removed.
 
     Raises:
-        DataError: If the folder is missing or cannot be written to.
+        DataError: If the folder is missing, or the file cannot be created or written.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    recording: _RecordingFile | None = None
     try:
+        _check_replaceable(path)
         partial.unlink(missing_ok=True)
-        with partial.open("xb") as file:
+        recording = _RecordingFile(partial)
+        file = io.BufferedWriter(recording)
+        try:
             yield file
-            _flush(file)
+            file.flush()
+            recording.sync()
+        finally:
+            # After a failed write the buffer is still full: closing would write it again and hide the first error.
+            with contextlib.suppress(OSError, ValueError):
+                file.close()
+            recording.close()
         os.replace(partial, path)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written: {one_line(error.strerror or error)}") from error
+    except Exception as error:
+        reason = recording.error if recording is not None and recording.error is not None else error
+        if isinstance(reason, OSError):
+            raise _refusal(path, reason) from error
+        raise
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
 
 
-def _flush(file: IO[bytes]) -> None:
-    file.flush()
-    os.fsync(file.fileno())
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8; atomic.
+
+    Raises:
+        DataError: If the file cannot be written.
+    """
+    with atomic_write(path) as file:
+        file.write(text.encode())
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as indented JSON; atomic.
+
+    Raises:
+        DataError: If the file cannot be written.
+    """
+    write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a text file, which is made if it is missing; the file keeps its lines if the write fails.
+
+    Raises:
+        DataError: If the file cannot be written.
+    """
+    with writing(path), path.open("ab", buffering=0) as file:
+        end = file.seek(0, os.SEEK_END)
+        data = memoryview(f"{line}\n".encode())
+        try:
+            while data:  # a write may take a part only, as on a disk with little room
+                data = data[file.write(data) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                file.truncate(end)
+            raise
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, unless it is there.
+
+    Raises:
+        DataError: If it cannot be made, or a file has its name.
+    """
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def require_new_folder(path: Path, *, flag: str = "--out", or_else: str = "") -> None:
+    """Refuse a path where anything but an empty folder is: results are never overwritten.
+
+    Args:
+        path: Folder that is going to be made.
+        flag: Option that the path was given with.
+        or_else: Another remedy, added to the message.
+
+    Raises:
+        DataError: If a file, or a folder with something in it, is there.
+    """
+    with writing(path):
+        free = not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+    if not free:
+        raise DataError(f"{path}: already exists and is not an empty folder; give {flag} another name{or_else}")
+
+
+def check_writable(path: Path, *, kind: Literal["file", "folder"] = "file") -> None:
+    """Refuse a path that cannot be written to, before the work whose results would be lost.
+
+    A block is written to a temporary file in the nearest folder that exists, which finds a full disk too. Nothing is
+    left there.
+
+    Args:
+        path: Where results will go.
+        kind: A file, whose folder must exist, or a folder, which :func:`make_folder` makes with those above it.
+
+    Raises:
+        DataError: If the path cannot be written to, or names the other kind.
+    """
+    with writing(path):
+        folder = path.parent if kind == "file" else path
+        existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+        if not existing.is_dir():
+            raise DataError(f"{path}: {existing} is a file, but a folder is needed there; give another path")
+        if kind == "file":
+            if not folder.is_dir():
+                raise DataError(f"{path}: the folder {folder} does not exist; make it first")
+            _check_replaceable(path)
+        with tempfile.TemporaryFile(dir=existing) as probe:
+            probe.write(bytes(_PROBE_BYTES))
+            probe.flush()
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to write inside the block into one line that names ``path``.
+
+    Raises:
+        DataError: In the place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise _refusal(path, error) from error
+
+
+_REMEDIES = {
+    errno.ENOSPC: "free some space there, or give another path",
+    errno.EDQUOT: "free some space there, or give another path",
+    errno.EFBIG: "free some space there or raise the limit, or give another path",
+    errno.EACCES: "give a path that you may write to",
+    errno.EPERM: "give a path that you may write to",
+    errno.EROFS: "give a path that you may write to",
+    errno.ENOENT: "make its folder first",
+    errno.ENOTDIR: "a file stands where a folder is needed; give another path",
+    errno.EEXIST: "a file stands where a folder is needed; give another path",
+    errno.EISDIR: "a folder has this name; give another path",
+    errno.ENAMETOOLONG: "give a shorter path",
+}
+
+
+def _refusal(path: Path, error: OSError) -> DataError:
+    """Return the error for the user: the path, the system's reason and a remedy."""
+    remedy = _REMEDIES.get(error.errno or 0, "give another path")
+    return DataError(f"{path}: cannot be written: {one_line(error.strerror or error)}; {remedy}")
+
+
+def _check_replaceable(path: Path) -> None:
+    """Refuse to put a file in the place of a folder or of a device: ``/dev/null`` must stay what it is."""
+    if path.is_dir():
+        raise DataError(f"{path}: is a folder, the name of a file is needed")
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: is not a regular file; give the name of a file")

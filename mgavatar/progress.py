@@ -10,10 +10,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from mgavatar.files import append_line
 
 _PLAIN_SECONDS = 10.0
 
@@ -108,19 +109,17 @@ class FitReporter:
 
 
 class MetricsLog:
-    """Append one JSON object per line to a file, flushed, so that a killed process loses nothing."""
+    """A file of one JSON object per line, each on the disk once it is written."""
 
     def __init__(self, path: Path | None) -> None:
-        """Open the file, or write nothing if ``path`` is None."""
-        self.file: IO[str] | None = path.open("a", encoding="utf-8") if path is not None else None
+        """Append to the file, or write nothing if ``path`` is None."""
+        self.path = path
 
     def write(self, **values: object) -> None:
-        """Append one line."""
-        if self.file is not None:
-            self.file.write(json.dumps(values) + "\n")
-            self.file.flush()
+        """Append one line.
 
-    def close(self) -> None:
-        """Close the file."""
-        if self.file is not None:
-            self.file.close()
+        Raises:
+            DataError: If the file cannot be written.
+        """
+        if self.path is not None:
+            append_line(self.path, json.dumps(values))

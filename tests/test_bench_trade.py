@@ -208,9 +208,10 @@ def test_a_wrong_command_line_is_said_in_one_line(monkeypatch, capsys, tmp_path)
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     flags = ("--avatar", tmp_path / "nothing.pt", "--data", tmp_path)
+    place = "a file stands where a folder is needed; give another path"
     for more, words in (
         (("--views", 0), "bench_trade.py: --views 0: must be at least 1\n"),
-        (("--out", blocked / "out"), f"bench_trade.py: --out {blocked / 'out'}: cannot be made: Not a directory\n"),
+        (("--out", blocked / "out"), f"{blocked / 'out'}: cannot be written: Not a directory; {place}\n"),
         (("--out", tmp_path / "out"), "nothing.pt: no such file\n"),
     ):
         assert run_tool(monkeypatch, *flags, *more) == 1

@@ -166,7 +166,7 @@ SPOILED: dict[Callable[[Path], None], tuple[str, ...]] = {
     nan_in_a_focal_length: ("transforms_val.json", "fl_x", "finite"),
     expression_of_another_length: ("00001.npz", "expr", "7", "3"),
     head_without_uvs: ("head.npz", "vt"),
-    full_folder: ("run", "not empty", "--resume"),
+    full_folder: ("run", "not an empty folder", "--resume"),
 }
 
 
@@ -224,7 +224,7 @@ def test_a_demo_overwrites_nothing(work, mgavatar):
     """Its folder is a new one."""
     full_folder(work)
     before = tree(work)
-    assert_one_line(mgavatar("demo", "--out", work / "run", "--device", "cpu"), "run", "give --out a new folder")
+    assert_one_line(mgavatar("demo", "--out", work / "run", "--device", "cpu"), "run", "give --out another name")
     assert tree(work) == before
 
 

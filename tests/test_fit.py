@@ -351,10 +351,10 @@ def test_where_a_fit_may_write(tmp_path):
 @pytest.mark.parametrize(
     ("out", "resume", "words"),
     [
-        ("full", False, "full: is not empty; .*--resume"),
-        ("file", False, "file: is a file; .*another folder"),
-        ("full.pt", False, "full: is not empty"),
-        ("taken.pt", False, r"taken\.pt: exists; .*another name"),
+        ("full", False, "full: already exists and is not an empty folder; .*--resume"),
+        ("file", False, "file: already exists and is not an empty folder"),
+        ("full.pt", False, "full: already exists and is not an empty folder"),
+        ("taken.pt", False, r"taken\.pt: already exists; .*another name"),
         ("full", True, r"checkpoint\.pt: nothing to resume; leave --resume out"),
         ("absent", True, r"checkpoint\.pt: nothing to resume"),
     ],

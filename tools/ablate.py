@@ -30,6 +30,7 @@ from statistics import fmean, stdev
 from typing import Any
 
 from mgavatar.errors import DataError
+from mgavatar.files import append_line, atomic_write, make_folder, write_json, write_text, writing
 from mgavatar.presets import preset_table
 from mgavatar.reporting.markdown import markdown_table
 
@@ -148,9 +149,8 @@ def run_command(command: Sequence[str], log: Path) -> int:
 
     Ctrl-C is passed on once, so that a fit can save its checkpoint.
     """
-    with log.open("ab") as file:
-        file.write(f"$ mgavatar {' '.join(command)}\n".encode())
-        file.flush()
+    append_line(log, f"$ mgavatar {' '.join(command)}")
+    with writing(log), log.open("ab") as file:
         child = subprocess.Popen(
             [*MGAVATAR, *command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
         )
@@ -166,8 +166,8 @@ def complete(cell: Cell) -> str | None:
     """Complete what a cell lacks; return the reason if that fails."""
     if cell.metrics.is_file() and not _lacks_lpips(cell):
         return None
-    cell.folder.mkdir(parents=True, exist_ok=True)
-    (cell.folder / "cell.json").write_text(json.dumps(cell.conditions(), indent=1), "utf-8")
+    make_folder(cell.folder)
+    write_json(cell.folder / "cell.json", cell.conditions())
     log = cell.folder / "log.txt"
     if not cell.summary.is_file():
         resume = (cell.run / "checkpoint.pt").is_file()
@@ -298,8 +298,8 @@ def _at(row: Row, path: tuple[str, ...]) -> Any:
 def write_table(rows: Sequence[Row], options: Options) -> None:
     """Write ``table.json`` and ``table.md``."""
     conditions = {"seeds": list(options.seeds), "budget": options.budget, "device": options.device}
-    (options.out / "table.json").write_text(json.dumps({**conditions, "rows": rows}, indent=1) + "\n", "utf-8")
-    (options.out / "table.md").write_text(table(rows, options), "utf-8")
+    write_json(options.out / "table.json", {**conditions, "rows": rows})
+    write_text(options.out / "table.md", table(rows, options))
 
 
 def write_sheet(cells: Sequence[Cell], options: Options) -> None:
@@ -312,13 +312,14 @@ def write_sheet(cells: Sequence[Cell], options: Options) -> None:
     for cell in finished:
         captures.setdefault(cell.data, []).append((cell.name, cell.run / "avatar.pt"))
     if captures:
-        Image.fromarray(contact_sheet(captures)).save(options.out / "sheet.png")
+        with atomic_write(options.out / "sheet.png") as file:
+            Image.fromarray(contact_sheet(captures)).save(file, format="PNG")
 
 
 def ablate(presets: Sequence[str], captures: Sequence[str], options: Options) -> int:
     """Complete all cells, write their results and return the number of those that failed."""
     cells = plan_cells(presets, captures, options)
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     rows: list[Row] = []
     for number, cell in enumerate(cells, start=1):
         print(f"{number}/{len(cells)} {cell.capture}, {cell.preset}, seed {cell.seed}", file=sys.stderr, flush=True)

@@ -22,8 +22,8 @@ from step_work import Bench, Size, refine, sizes
 
 from mgavatar.appearance.stage import AppearanceStage
 from mgavatar.benchmarks.machine import commit_of_checkout, device_name, thread_limit
-from mgavatar.benchmarks.report import check_report_path, write_report
 from mgavatar.errors import DataError
+from mgavatar.files import check_writable, write_json
 from mgavatar.fitting.stage import Stage
 from mgavatar.kernels import bridge
 from mgavatar.reporting.markdown import markdown_table
@@ -154,7 +154,8 @@ def bench_fit(
             raise DataError(f"--{name} {value}: must be at least 1")
     if device == "cuda" and not torch.cuda.is_available():
         raise DataError("--device cuda: this machine has no CUDA device that torch can use; give --device cpu")
-    check_report_path(json)
+    if json is not None:
+        check_writable(json)
     where = torch.device(device)
     chosen = [size for size in sizes() if size.name in names]
     with thread_limit(n_threads):
@@ -162,7 +163,7 @@ def bench_fit(
     name = device_name(where)
     if json is not None:
         report = {"device": name, "threads": n_threads, "commit": commit_of_checkout()}
-        write_report(json, report | {"rows": [asdict(row) for row in rows]})
+        write_json(json, report | {"rows": [asdict(row) for row in rows]})
     return f"{name}; {n_threads} threads; medians of {steps} steps\n\n{fit_table(rows)}"
 
 

@@ -22,10 +22,9 @@ from trade_raster import Reference, Row, measure_knob, raster_knobs, scenes_of
 
 from mgavatar.avatar import Avatar
 from mgavatar.benchmarks.machine import commit_of_checkout, device_name, thread_limit
-from mgavatar.benchmarks.report import write_report
 from mgavatar.capture.read import read_capture
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write, one_line
+from mgavatar.files import make_folder, write_json, write_text
 from mgavatar.kernels import bridge
 
 
@@ -65,7 +64,7 @@ def bench_trade(
     for name, value in (counts | {"threads": n_threads}).items():
         if value < 1:
             raise DataError(f"--{name} {value}: must be at least 1")
-    _make_folder(out)
+    make_folder(out)
     loaded = Avatar.load(avatar / "avatar.pt" if avatar.is_dir() else avatar)
     with thread_limit(n_threads):
         scenes = scenes_of(loaded, read_capture(data), views=views, max_image_size=max_image_size)
@@ -87,22 +86,14 @@ def bench_trade(
     return _write(out, report, rows)
 
 
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"--out {path}: cannot be made: {one_line(error.strerror)}") from error
-
-
 def _write(out: Path, report: dict[str, Any], rows: list[Row]) -> str:
-    write_report(out / "trade.json", report | {"rows": [asdict(row) for row in rows]})
+    write_json(out / "trade.json", report | {"rows": [asdict(row) for row in rows]})
     width, height = report["size"]
     scene = f"{report['gaussians']} Gaussians, {width} x {height}, {report['views']} views"
     heading = f"{report['device']}, {report['threads']} threads; {report['date']}, commit {report['commit']}; {scene}"
     remainder = f"Without any threshold the exact image changes by {report['exact_remainder']:.1e}."
     text = f"{heading}\n\n{table(rows)}\n\n{remainder}"
-    with atomic_write(out / "trade.md") as file:
-        file.write((text + "\n").encode())
+    write_text(out / "trade.md", text + "\n")
     draw_chart(rows, out / "trade.png", title=f"What each shortcut costs: {scene}")
     return text
 

@@ -25,8 +25,8 @@ from mgavatar.benchmarks.machine import (
     now,
     thread_limit,
 )
-from mgavatar.benchmarks.report import check_report_path, write_report
 from mgavatar.errors import DataError
+from mgavatar.files import check_writable, write_json
 from mgavatar.kernels import bridge
 from mgavatar.kernels.rasterize import RasterSettings
 from mgavatar.reporting.markdown import markdown_table
@@ -168,7 +168,8 @@ def bench_kernels(
     n = bridge.num_threads() if threads is None else threads
     if n < 1:
         raise DataError(f"--threads {n}: must be at least 1")
-    check_report_path(json_path)
+    if json_path is not None:
+        check_writable(json_path)
     rows: list[Row] = []
     with thread_limit(n):
         machine = calibrate(where)
@@ -186,7 +187,7 @@ def bench_kernels(
             "blending_share": share,
             "rows": [asdict(row) for row in rows],
         }
-        write_report(json_path, report)
+        write_json(json_path, report)
     growth = ", ".join(f"{what} {exponent:.2f}" for what, exponent in exponents.items())
     speed = f"{machine.operations / 1e9:.0f} G multiply-adds/s, {machine.bytes / 1e9:.1f} GB/s"
     notes = [f"blending is {100 * share:.0f} % of rasterize at 20K, 512 x 512", f"exponents of its time: {growth}"]

@@ -22,7 +22,7 @@ from torch import Tensor
 from mgavatar import __version__
 from mgavatar.camera import Camera
 from mgavatar.errors import DataError
-from mgavatar.files import one_line
+from mgavatar.files import check_writable, one_line, require_new_folder, writing
 from mgavatar.kernels.rasterize import Rendering
 
 FileKind = Literal["mp4", "gif", "png", "exr"]
@@ -92,14 +92,16 @@ def _check_replaceable(out: Path, kind: FileKind, *, overwrite: bool) -> None:
     if not out.parent.is_dir():
         raise DataError(f"{out}: the folder {out.parent} does not exist; make it first")
     if kind in ("png", "exr"):
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise DataError(f"{out}: already there and not an empty folder; remove it or give another name")
-    elif out.exists():
-        offset, magic = _MAGIC[kind]
-        if not out.is_file() or _first_bytes(out)[offset : offset + len(magic)] != magic:
-            raise DataError(f"{out}: already there and not a .{kind} file; remove it or give another name")
-        if not overwrite:
-            raise DataError(f"{out}: exists; give --out another name, or --overwrite to replace it")
+        require_new_folder(out)
+        check_writable(out, kind="folder")
+    else:
+        if out.exists():
+            offset, magic = _MAGIC[kind]
+            if not out.is_file() or _first_bytes(out)[offset : offset + len(magic)] != magic:
+                raise DataError(f"{out}: already exists and is not a .{kind} file; give --out another name")
+            if not overwrite:
+                raise DataError(f"{out}: already exists; give --out another name, or --overwrite to replace it")
+        check_writable(out)
 
 
 def _first_bytes(path: Path) -> bytes:
@@ -128,22 +130,22 @@ def frame_writer(out: Path, kind: FileKind, *, fps: float) -> Iterator[FrameSink
     partial = out.with_name(f".{out.name}.{os.getpid()}.part")
     writers = {"mp4": _mp4, "gif": _gif, "png": _png_folder, "exr": _exr_folder}
     try:
-        _remove(partial)
-        with writers[kind](partial, fps) as sink:
-            yield sink
-        if out.is_dir():
-            out.rmdir()
-        os.replace(partial, out)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be written: {one_line(error.strerror or error)}") from error
+        with writing(out):
+            _remove(partial)
+            with writers[kind](partial, fps) as sink:
+                yield sink
+            if out.is_dir():
+                out.rmdir()
+            os.replace(partial, out)
     finally:
         _remove(partial)
 
 
 def _remove(path: Path) -> None:
+    """Remove a file or a folder as far as the system allows; an error would hide the one that led here."""
     if path.is_dir():
         shutil.rmtree(path, ignore_errors=True)
-    else:
+    with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
 
 
@@ -243,6 +245,9 @@ def write_exr(path: Path, rendering: Rendering, camera: Camera, *, frame: int) -
         rendering: A frame drawn over black.
         camera: Its camera, for the header.
         frame: Its number, for the header.
+
+    Raises:
+        OSError: If the file cannot be written.
     """
     import kornia.color
 
@@ -255,7 +260,10 @@ def write_exr(path: Path, rendering: Rendering, camera: Camera, *, frame: int) -
     depth = torch.where(covered, rendering.depths.detach().cpu() / divisor, EMPTY_DEPTH).float()
     channels = {"RGBA": rgba.contiguous().numpy(), "Z": depth.contiguous().numpy()}
     with OpenEXR.File(_exr_header(camera, frame), channels) as file:
-        file.write(str(path))
+        try:
+            file.write(str(path))
+        except RuntimeError as error:  # OpenEXR's word for every refusal of the system
+            raise OSError(str(error)) from error
 
 
 def _exr_header(camera: Camera, frame: int) -> dict[str, Any]:

@@ -97,8 +97,6 @@ def fit_avatar(
     except TooShort:
         discard_run(run)
         raise
-    finally:
-        metrics.close()
     close_run(run, avatar, summary, decisions, budget=budget, seed=seed)
     return avatar
 

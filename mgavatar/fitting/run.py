@@ -14,7 +14,7 @@ import torch
 from mgavatar.avatar import Avatar
 from mgavatar.config import ResolvedConfig
 from mgavatar.errors import DataError
-from mgavatar.files import existing_file
+from mgavatar.files import check_writable, existing_file, make_folder, require_new_folder, write_text
 from mgavatar.fitting.budget import Budget, duration
 from mgavatar.fitting.plan import Decision
 from mgavatar.fitting.stage import Stage
@@ -49,20 +49,19 @@ def open_run(out: Path, *, resume: bool) -> Run:
     """Decide where a fit writes: ``out`` is a folder, or the path of the avatar itself (``out.pt``).
 
     Raises:
-        DataError: If there is something already, and it is not to be resumed; or nothing to resume.
+        DataError: If there is something already, and it is not to be resumed; or nothing to resume; or if nothing can
+            be written there.
     """
     folder = out.with_suffix("") if out.suffix == ".pt" else out
     run = Run(folder, out if out.suffix == ".pt" else folder / "avatar.pt")
     if resume:
         if not run.checkpoint.is_file():
             raise DataError(f"{run.checkpoint}: nothing to resume; leave --resume out to start a fit there")
-        return run
-    if folder.exists() and not folder.is_dir():
-        raise DataError(f"{folder}: is a file; give --out another folder")
-    if folder.is_dir() and any(folder.iterdir()):
-        raise DataError(f"{folder}: is not empty; give --out another folder, or --resume to go on with the fit there")
-    if run.avatar.exists():
-        raise DataError(f"{run.avatar}: exists; give --out another name")
+    else:
+        require_new_folder(folder, or_else=", or --resume to go on with the fit there")
+        if run.avatar.exists():
+            raise DataError(f"{run.avatar}: already exists; give --out another name")
+    check_writable(folder, kind="folder")
     return run
 
 
@@ -80,8 +79,8 @@ def open_checkpoint(
     if run is None:
         return None, budget
     if not resume:
-        run.folder.mkdir(parents=True, exist_ok=True)
-        (run.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
+        make_folder(run.folder)
+        write_text(run.folder / "config.toml", to_toml(config))
         return None, budget
     checkpoint = _read_checkpoint(run, config, seed)
     if budget is None and checkpoint["budget"] is not None:

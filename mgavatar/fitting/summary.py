@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -11,7 +10,7 @@ from typing import Any
 
 import torch
 
-from mgavatar.files import atomic_write
+from mgavatar.files import write_json
 
 
 class Summary:
@@ -60,8 +59,7 @@ class Summary:
         table = self.state() | more
         if torch.cuda.is_available():
             table["peak_cuda_mib"] = round(torch.cuda.max_memory_allocated() / 2**20, 1)
-        with atomic_write(path) as file:
-            file.write((json.dumps(table, indent=2) + "\n").encode())
+        write_json(path, table)
 
 
 def peak_mib() -> float | None:

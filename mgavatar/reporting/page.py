@@ -25,7 +25,7 @@ from mgavatar.config import FitConfig
 from mgavatar.driving.motion import Driving
 from mgavatar.driving.retarget import poses_of
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write
+from mgavatar.files import atomic_write, make_folder
 from mgavatar.fitting.budget import duration
 from mgavatar.reporting.charts import Chart, Line, loss_chart, read_history
 from mgavatar.reporting.pictures import ERROR_GAIN, SIDE_DEGREES, comparison, first_timestep, mesh_comparison, strip
@@ -114,7 +114,7 @@ def write_report(
         DataError: If an image of the capture is damaged, or the folder cannot be written to.
     """
     folder = run / "pictures"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     views = _view_pictures(avatar, subject)
     mesh, driven = _mesh_picture(avatar, subject), _driven_picture(avatar, subject, driving)
     for picture in (*views, mesh, driven):

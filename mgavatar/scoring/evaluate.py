@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from mgavatar.avatar import Avatar
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Frame, Split, Subject
 from mgavatar.errors import DataError
-from mgavatar.files import atomic_write
+from mgavatar.files import write_json
 from mgavatar.head.params import HeadParams, Pose
 from mgavatar.scoring.baselines import NaiveBaselines
 from mgavatar.scoring.geometry import REACH, score_geometry
@@ -148,9 +147,12 @@ def _score_truth(avatar: Avatar, subject: Subject, truth: Truth) -> tuple[dict[s
 
 
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
-    """Write ``metrics.json``, whole or not at all."""
-    with atomic_write(path) as file:
-        file.write((json.dumps(metrics, indent=2) + "\n").encode())
+    """Write ``metrics.json``, whole or not at all.
+
+    Raises:
+        DataError: If the file cannot be written.
+    """
+    write_json(path, metrics)
 
 
 def spread(items: Sequence[T], count: int | None) -> tuple[T, ...]:

@@ -21,6 +21,7 @@ from PIL import Image
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import SPLITS, Split
 from mgavatar.errors import DataError
+from mgavatar.files import check_writable, require_new_folder, writing
 from mgavatar.head.find import BUILTIN, HEAD_MODEL_FILE, HEAD_MODEL_KEY
 from mgavatar.head.load import save_head_model
 from mgavatar.head.model import HeadModel
@@ -86,27 +87,24 @@ def make_synthetic_capture(
     motion = perform(head, timesteps, rng, turn=_TURN)
     views = [front_camera(size), *side_cameras(size)] if monocular else frontal_arc(cameras, size)
     partial = out.with_name(f".{out.name}.partial-{os.getpid()}")
+    members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
     try:
-        partial.mkdir(parents=True)
-        members = _monocular_splits(len(views), timesteps) if monocular else _splits(len(views), timesteps)
-        truth = _shoot_all(partial, studio, motion, views, members, progress)
-        _write_params(partial, head, tracked(motion, rng))
-        _write_transforms(partial, views, members, head_model=_write_head_model(partial, head))
-        _write_truth(partial, person, motion, seed, *truth)
-        if out.exists():
-            out.rmdir()
-        partial.rename(out)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(f"{out}: cannot write the capture ({reason}); choose another folder") from error
+        with writing(out):
+            partial.mkdir(parents=True)
+            truth = _shoot_all(partial, studio, motion, views, members, progress)
+            _write_params(partial, head, tracked(motion, rng))
+            _write_transforms(partial, views, members, head_model=_write_head_model(partial, head))
+            _write_truth(partial, person, motion, seed, *truth)
+            if out.exists():
+                out.rmdir()
+            partial.rename(out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return out
 
 
 def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, monocular: bool) -> None:
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DataError(f"{out}: already exists and is not an empty folder; choose another folder or remove it")
+    require_new_folder(out)
     if cameras < 2 and not monocular:
         raise DataError(
             f"{out}: {cameras} cameras leave none to hold out; ask for 2 or more, or for a monocular capture"
@@ -115,6 +113,7 @@ def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, mo
         raise DataError(f"{out}: {timesteps} timesteps cannot be split into training and test; ask for 2 or more")
     if min(size) < 8:
         raise DataError(f"{out}: images of {size[0]} x {size[1]} pixels show nothing; ask for 8 x 8 or more")
+    check_writable(out, kind="folder")
 
 
 Members = dict[Split, set[tuple[int, int]]]
