@@ -1,4 +1,4 @@
-"""The procedural head: a sound mesh and atlas, a rig and directions that do what their names say."""
+"""The built-in head: a sound mesh and atlas, a rig, and directions that do what their names say."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""A head model in FLAME's schema that the program builds itself: no licensed data, the same arrays every time.
+"""The built-in head: a head model in FLAME's schema without licensed data, the same arrays at every call.
 
-The pieces, in the order in which they are made: the form of the head (``surface``), its triangulation
-(``sheet``), mesh and texture atlas (``mesh``, with ``ear`` and ``parts``),
-joints and skinning (``rig``), identity and expression directions (``identity``,
-``expression``).
+It is built in this order: the form of the head (``surface``), its triangulation (``sheet``), the mesh and its texture
+atlas (``mesh``, with ``ear`` and ``parts``), joints and skinning (``rig``), identity and expression directions
+(``identity``, ``expression``).
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from mgavatar.head.procedural.rig import (
 
 @lru_cache(maxsize=1)
 def build_head() -> HeadModel:
-    """Build the procedural head: about 5,000 vertices, 300 identity and 100 expression directions.
+    """Build the built-in head: about 5,000 vertices, 300 identity and 100 expression directions.
 
-    The result is kept in memory and shared: do not change its arrays.
+    It is built once per process (2 s) and shared: do not change its arrays.
 
     Returns:
-        The model in FLAME's frame, ``expr_basis`` ``"procedural"``.
+        The head model, with ``expr_basis`` ``"procedural"``.
     """
     mesh = build_mesh()
     jaw = jaw_share(mesh)
@@ -43,7 +42,7 @@ def build_head() -> HeadModel:
         "v_template": mesh.verts.astype(np.float32),
         "faces": mesh.faces.astype(np.int32),
         "shapedirs": np.concatenate([shape, expr], axis=-1).astype(np.float32),
-        "posedirs": pose_correctives(mesh, jaw).astype(np.float32),
+        "posedirs": pose_correctives(mesh).astype(np.float32),
         "J_regressor": joint_regressor(mesh).astype(np.float32),
         "lbs_weights": skinning_weights(mesh, jaw).astype(np.float32),
         "parents": PARENTS.copy(),

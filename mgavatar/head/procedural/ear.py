@@ -1,4 +1,4 @@
-"""The left ear of the procedural head: rings from the skin around it over its rim into the concha."""
+"""The left ear of the built-in head: rings from the skin around it over its rim into the concha."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ Array = np.ndarray
 EAR_ANGLE, EAR_LEVEL = 1.60, 6.75
 """Centre of the ear on the head's sheet."""
 HALF_WIDTH, HALF_HEIGHT, LEAN = 0.0168, 0.0305, 0.10
+"""Half width and half height of the rim [m]; backward lean of its axis [m per m of height]."""
 
-# A row a ring, from outside to inside: size behind the ear, size before it, share of the plate's height, lift [mm].
+# One row per ring, from outside to inside: size behind the ear, size before it, share of the plate's height, lift [mm].
 RINGS = np.array(
     [
         (1.10, 1.10, 0.0, 0.0),  # skin around the ear
@@ -33,7 +34,7 @@ RINGS = np.array(
 
 
 def _ring(skin: Callable[[Array], Array], centre: Array, row: Array, t: Array) -> Array:
-    """Points of one ring at the angles ``t``: 0 backwards, pi/2 up."""
+    """Return the points of one ring at the angles ``t`` (0 backwards, pi/2 up), shape [N, 3] [m]."""
     c, s = np.cos(t), np.sin(t)
     behind = smoothstep(-0.75, 0.25, c)
     size = row[1] + (row[0] - row[1]) * behind
@@ -52,16 +53,16 @@ def _ring(skin: Callable[[Array], Array], centre: Array, row: Array, t: Array) -
 def ear_rings(
     skin: Callable[[Array], Array], *, n: int, around: float, q_of_level: Callable[[float], float]
 ) -> tuple[list[Array], list[Array]]:
-    """Rings of the left ear, from outside to inside, the last a single point.
+    """Return the rings of the left ear, from outside to inside; the last is a single point.
 
     Args:
-        skin: Maps points (p, q) of the head's sheet to the bare skin [m].
-        n: Points of a ring.
-        around: Sheet metres per radian.
-        q_of_level: q of a level of the head.
+        skin: Maps points (p, q) of the head's sheet, shape [N, 2], to the bare skin, shape [N, 3] [m].
+        n: Number of points per ring, N.
+        around: Metres on the sheet per radian.
+        q_of_level: Maps a level of the head to q.
 
     Returns:
-        Points on the sheet, where the rings are nested ellipses; points in space [m].
+        The rings on the sheet, nested ellipses, shape [N, 2] each; and in space, shape [N, 3] each [m].
     """
     centre = np.array([EAR_ANGLE * around, float(q_of_level(EAR_LEVEL))])
     # Seen from outside, the left half's p grows to the right and q upwards: this ring is counter-clockwise.

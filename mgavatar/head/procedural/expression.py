@@ -1,4 +1,4 @@
-"""Expression directions of the procedural head: local, smooth, in mirrored pairs."""
+"""Expression directions of the built-in head: local, smooth, in mirrored pairs."""
 
 from __future__ import annotations
 
@@ -16,15 +16,21 @@ Zone = Literal["all", "upper", "lower"]
 
 N_EXPR = 100
 LID_REACH = (1.0, 0.86, 0.66, 0.42, 0.18, 0.0)
-"""Share of the lid's rotation that the rings from its edge outwards take."""
-
+"""Share of the lid's rotation in each ring around the eye, from the edge of the lids outwards."""
 
 SOCKET_SHARE = (0.9, 0.6, 0.3, 0.1, 0.0, 0.0)
-"""How much the rings inside the mouth follow the edge of the lips."""
+"""Share of the motion of the lips' edge in each ring inside the mouth, from the lips inwards."""
 
 
 class Pull(NamedTuple):
-    """A bell on the featureless face that moves one way; [mm]."""
+    """A displacement in one direction that falls off like a bell around a point of the featureless face.
+
+    Attributes:
+        at: Centre of the bell, x and y [mm].
+        width: Width of the bell in x and y [mm].
+        shift: Displacement in the centre [mm].
+        zone: Restricts the displacement to the face above or below the mouth line.
+    """
 
     at: tuple[float, float]
     width: tuple[float, float]
@@ -32,7 +38,7 @@ class Pull(NamedTuple):
     zone: Zone = "all"
 
 
-# Left halves of mirrored pairs: name_L is as written, name_R its mirror image.
+# Left halves of mirrored pairs: name_L is as written here, name_R is its mirror image.
 PAIRS: dict[str, tuple[Pull, ...]] = {
     "smile": (
         Pull((25, -46), (12, 12), (5.5, 6.5, -4)),
@@ -55,7 +61,7 @@ PAIRS: dict[str, tuple[Pull, ...]] = {
     "jaw_clench": (Pull((50, -56), (14, 16), (3, 0, 0.5)),),
 }
 
-# Both sides at once.
+# Directions that move both sides.
 CENTRED: dict[str, tuple[Pull, ...]] = {
     "pucker": (
         Pull((24, -47), (12, 14), (-8.5, 0, 3.5)),
@@ -81,7 +87,7 @@ CENTRED: dict[str, tuple[Pull, ...]] = {
 
 
 def _details() -> list[tuple[str, tuple[Pull, ...]]]:
-    """Finer local pairs around mouth, brows, cheeks and chin."""
+    """Return the left halves of finer pairs around mouth, brows, cheeks and chin."""
     out: list[tuple[str, tuple[Pull, ...]]] = []
     zones: tuple[tuple[Zone, float], ...] = (("upper", 4.0), ("lower", -4.5))
     for zone, offset in zones:
@@ -99,7 +105,14 @@ def _details() -> list[tuple[str, tuple[Pull, ...]]]:
 
 
 class _Face:
-    """What all directions need: where each vertex is on the featureless face, and how far it may move."""
+    """The mesh as all directions see it.
+
+    Attributes:
+        mesh: The mesh.
+        rest: Place of each vertex on the featureless face [m], shape [V, 3]; inside the mouth, that of the lip's edge.
+        movable: Share of a pull in the motion of each vertex, 0..1, shape [V].
+        upper: 1 above the mouth line, 0 below it, smooth between, shape [V].
+    """
 
     def __init__(self, mesh: HeadMesh) -> None:
         self.mesh = mesh
@@ -112,11 +125,11 @@ class _Face:
                 self.rest[inner], self.movable[inner] = self.rest[outer], share
         self.upper = smoothstep(-0.0042, 0.0042, self.rest[:, 1] - form.MOUTH_Y)
         from_eye = np.stack([np.abs(self.rest[:, 0]), self.rest[:, 1]], axis=1) - form.EYE[:2]
-        # Only lid directions move the lids.
+        # Only the lid directions move the lids: any other motion would push them into the eyeball.
         self.movable *= smoothstep(0.75, 1.45, np.linalg.norm(from_eye / [0.0175, 0.0105], axis=1))
 
     def pulls(self, pulls: tuple[Pull, ...]) -> Array:
-        """The displacement of some pulls, shape [V, 3] [m]."""
+        """Return the sum of some pulls, shape [V, 3] [m]."""
         out = np.zeros_like(self.rest)
         for pull in pulls:
             offset = (self.rest[:, :2] - np.array(pull.at) / 1000.0) / (np.array(pull.width) / 1000.0)
@@ -126,30 +139,47 @@ class _Face:
         return out
 
     def left(self) -> Array:
-        """1 on the left, 0 on the right, smooth across the middle, shape [V, 1]."""
+        """Return 1 on the left, 0 on the right, smooth across the middle, shape [V, 1]."""
         return smoothstep(-0.007, 0.007, self.mesh.verts[:, :1])
 
     def mirrored(self, field: Array) -> Array:
-        """The mirror image of a displacement."""
+        """Return the mirror image of a displacement, shape [V, 3]."""
         return field[self.mesh.mirror] * MIRROR_X
 
 
 def _rotate_about_eye(points: Array, angle: Array) -> Array:
-    """Displacement by a rotation about the x axis through the left eye; positive raises the front."""
+    """Return the displacement by a rotation about the x axis through the left eye; a positive one raises the front.
+
+    Args:
+        points: Shape [N, 3] [m].
+        angle: Angle of each point [rad], shape [N].
+    """
     y, z = points[:, 1] - form.EYE[1], points[:, 2] - form.EYE[2]
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.zeros_like(y), y * c + z * s - y, z * c - y * s - z], axis=1)
 
 
 def lid_direction(mesh: HeadMesh, *, upper: float, lower: float) -> Array:
-    """Displacement of the left lids; 1 takes a lid all the way to the line where they meet, [V, 3] [m]."""
+    """Return the displacement of the left lids, shape [V, 3] [m].
+
+    Each point of their edge turns about the horizontal axis through the eye, and so stays outside the eyeball.
+
+    Args:
+        mesh: The mesh.
+        upper: Turn of the upper lid; 1 takes it to the line where the lids meet, a negative one opens it further.
+        lower: The same for the lower lid.
+    """
     edge = mesh.groups["lid_0"]
     at = mesh.verts[edge] - form.EYE
     n = len(edge)
-    opposite = at[(n - np.arange(n)) % n, 1]  # the ring is sampled evenly: the mirrored index is above or below
+    # The ring is sampled evenly in its angle from 0 (outer corner) over pi (inner corner): the angles t and -t are one
+    # above the other, so the partner of point i on the other lid is point n - i.
+    opposite = at[(n - np.arange(n)) % n, 1]
     is_upper = np.arange(n) <= n // 2
     low, high = np.minimum(at[:, 1], opposite), np.maximum(at[:, 1], opposite)
-    meet = low + 0.30 * (high - low) + np.where(is_upper, 0.00006, -0.00006) * (high - low > 1e-5)
+    gap = np.where(is_upper, 0.00006, -0.00006) * (high - low > 1e-5)  # the closed lids do not touch
+    meet = low + 0.30 * (high - low) + gap
+    # The height of a point at angle a about the axis is radius * sin(a): the turn that brings it to ``meet`` follows.
     radius = np.hypot(at[:, 1], at[:, 2])
     turn = np.arcsin(np.clip(meet / radius, -1, 1)) - np.arctan2(at[:, 1], at[:, 2])
     turn *= np.where(is_upper, upper, lower)
@@ -162,12 +192,16 @@ def lid_direction(mesh: HeadMesh, *, upper: float, lower: float) -> Array:
 
 
 def jaw_directions(mesh: HeadMesh, jaw: Array) -> list[tuple[str, Array]]:
-    """Motions of the jaw's own part of the mesh, shape [V, 3] each [m]."""
+    """Return named motions of the jaw and all that follows it, shape [V, 3] each [m].
+
+    Args:
+        mesh: The mesh.
+        jaw: Share of the jaw's motion in that of each vertex, shape [V].
+    """
     from_joint = mesh.verts - JOINTS_AT[2]
     c, s = np.cos(0.22), np.sin(0.22)
-    opened = np.stack(
-        [from_joint[:, 0], from_joint[:, 1] * c - from_joint[:, 2] * s, from_joint[:, 1] * s + from_joint[:, 2] * c], 1
-    )
+    x, y, z = from_joint.T
+    opened = np.stack([x, y * c - z * s, y * s + z * c], axis=1)  # turned about the x axis
     motions = {"jaw_open": opened - from_joint}
     motions["jaw_left"] = np.broadcast_to(np.array([0.006, 0.0, 0.0]), from_joint.shape)
     motions["jaw_right"] = np.broadcast_to(np.array([-0.006, 0.0, 0.0]), from_joint.shape)
@@ -176,11 +210,14 @@ def jaw_directions(mesh: HeadMesh, jaw: Array) -> list[tuple[str, Array]]:
 
 
 def expression_directions(mesh: HeadMesh, jaw: Array) -> tuple[Array, tuple[str, ...]]:
-    """Directions [V, 3, 100] [m], unit = fully on, and their names.
+    """Return the expression directions and their names.
 
     Args:
         mesh: The mesh.
-        jaw: How much each vertex follows the jaw, shape [V].
+        jaw: Share of the jaw's motion in that of each vertex, shape [V].
+
+    Returns:
+        Directions, shape [V, 3, 100] [m]; a coefficient of 1 is the full expression. Names, 100 of them.
     """
     face = _Face(mesh)
     named: list[tuple[str, Array]] = []

@@ -1,4 +1,4 @@
-"""Identity directions of the procedural head: named proportions first, then smooth band-limited fields."""
+"""Identity directions of the built-in head: named proportions first, then smooth band-limited fields."""
 
 from __future__ import annotations
 
@@ -17,24 +17,27 @@ Field = Callable[[Array], Array]
 N_SHAPE = 300
 SEED = 20
 CENTRE = np.array([0.0, 0.02, -0.045])
+"""Middle of the head [m]."""
 
 
 def _spread(scale: tuple[float, float, float]) -> Field:
+    """Return a field that scales the head about its middle along the axes."""
     return lambda p: (p - CENTRE) * np.array(scale)
 
 
 def _within(field: Field, y: tuple[float, float, float, float]) -> Field:
-    """``field`` between heights [mm]: rising from the first to the second, falling from the third to the fourth."""
+    """Restrict a field to heights [mm]: it rises from the first to the second, falls from the third to the fourth."""
     a, b, c, d = (v / 1000.0 for v in y)
     return lambda p: field(p) * (smoothstep(a, b, p[:, 1]) * (1.0 - smoothstep(c, d, p[:, 1])))[:, None]
 
 
 def _front(field: Field) -> Field:
+    """Restrict a field to the front of the head."""
     return lambda p: field(p) * smoothstep(-0.05, 0.02, p[:, 2])[:, None]
 
 
 def _bell(centre: tuple[float, ...], width: tuple[float, ...], shift: tuple[float, ...]) -> Field:
-    """A bell around ``centre`` and its mirror image [mm], moved by ``shift`` and its mirror image."""
+    """Return a field that moves a bell around ``centre`` [mm] by ``shift``, and its mirror image symmetrically."""
 
     def field(p: Array) -> Array:
         out = np.zeros_like(p)
@@ -48,15 +51,16 @@ def _bell(centre: tuple[float, ...], width: tuple[float, ...], shift: tuple[floa
 
 
 def _sum(*fields: Field) -> Field:
+    """Add up fields."""
     return lambda p: np.sum([f(p) for f in fields], axis=0)
 
 
 def _skew(shift: tuple[float, float, float], axis: int, width: float) -> Field:
-    """A sideways asymmetry: ``shift`` with the sign of x, or a lean that grows along ``axis``."""
+    """Return a field that shifts both sides of the middle in opposite directions; ``axis`` tells the sides apart."""
     return lambda p: np.tanh((p[:, axis : axis + 1] - CENTRE[axis]) / width) * np.array(shift)
 
 
-# The first ones matter most: their rms falls as in AMPLITUDE_MM.
+# In the order of their size: AMPLITUDE_MM has the first ones.
 NAMED: tuple[tuple[str, Field], ...] = (
     ("size", _spread((1, 1, 1))),
     ("head_width", _within(_spread((1, 0, 0)), (-120, -80, 300, 301))),
@@ -98,13 +102,13 @@ NAMED: tuple[tuple[str, Field], ...] = (
     ("chin_aside", _bell((0, -82, 36), (30, 24, 40), (1, 0, 0))),
 )  # fmt: skip
 AMPLITUDE_MM = (2.0, 1.6, 1.5, 1.3, 1.1, 1.0, 0.9, 0.8, 0.8, 0.75)
-"""Root mean square of the first directions over all vertices."""
+"""Root mean square of the first directions over all vertices [mm]."""
 LARGEST_MM = 7.0, 2.6
-"""No vertex moves farther than that for one standard deviation: the first directions, the others."""
+"""Largest motion of a vertex per standard deviation [mm]: of the first directions, of the others."""
 
 
 def _waves(rng: np.random.Generator, wavelength: float, *, symmetric: bool) -> Field:
-    """A random vector field of a few plane waves of about one wavelength [m]."""
+    """Draw a vector field of six plane waves of one wavelength [m]."""
     directions = rng.normal(size=(6, 3))
     directions *= 2 * np.pi / wavelength / np.linalg.norm(directions, axis=1, keepdims=True)
     phases, amplitudes = rng.uniform(0, 2 * np.pi, 6), rng.normal(size=(6, 3))
@@ -120,6 +124,7 @@ def _waves(rng: np.random.Generator, wavelength: float, *, symmetric: bool) -> F
 
 
 def _fields() -> list[Field]:
+    """Return 300 fields: the named ones, then waves from 30 cm down to 5 cm, every third of them asymmetric."""
     rng = np.random.default_rng(SEED)
     fields = [field for _, field in NAMED]
     n_waves = N_SHAPE - len(fields)
@@ -130,10 +135,9 @@ def _fields() -> list[Field]:
 
 
 def identity_directions(mesh: HeadMesh) -> Array:
-    """Orthogonal directions of identity, unit = one standard deviation, shape [V, 3, 300] [m].
+    """Return orthogonal identity directions, shape [V, 3, 300] [m]; a coefficient of 1 is one standard deviation.
 
-    Near each eye a field is replaced by its value at the eye's centre, so that the lids keep fitting the eyeball,
-    which moves as a whole.
+    Near each eye, a field is replaced by its value in the eye's centre, so that the lids keep fitting the eyeball.
     """
     verts = mesh.verts
     at = np.where(verts[:, :1] > 0, 1.0, -1.0) * [form.EYE[0], 0.0, 0.0] + [0.0, form.EYE[1], form.EYE[2]]
@@ -142,7 +146,8 @@ def identity_directions(mesh: HeadMesh) -> Array:
     held[mesh.part == "eye"] = 1.0
     raw = np.stack([f(verts) * (1 - held[:, None]) + f(at) * held[:, None] for f in _fields()], axis=-1)
     flat = raw.reshape(-1, N_SHAPE)
-    # Gram and Schmidt in order, by way of Cholesky: each field loses what those before it can do.
+    # Gram and Schmidt: each field loses its part in the span of the fields before it. With the Cholesky factor
+    # flat.T @ flat = L @ L.T, the columns of flat @ inv(L).T are the orthonormal ones, in the same order.
     q = solve_triangular(np.linalg.cholesky(flat.T @ flat), flat.T, lower=True).T
     rms = 0.22 * (len(NAMED) / np.maximum(np.arange(N_SHAPE), len(NAMED))) ** 0.9
     rms[: len(NAMED)] = 0.7
@@ -150,5 +155,5 @@ def identity_directions(mesh: HeadMesh) -> Array:
     directions = (q * np.sqrt(len(verts))).reshape(raw.shape)
     limit = np.where(np.arange(N_SHAPE) < len(AMPLITUDE_MM), *LARGEST_MM)
     scale = np.minimum(rms, limit / np.linalg.norm(directions, axis=1).max(axis=0))
-    # Rounded to 10 nanometres, so that the sums' order (threads, machines) leaves no trace in the bits.
+    # Rounded to 10 nanometres: sums in another order (threads, machines) then give the same bits.
     return np.round(directions * scale / 1000.0, 8)

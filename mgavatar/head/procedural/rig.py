@@ -1,4 +1,4 @@
-"""Joints, skinning weights, pose correctives and regions of the procedural head."""
+"""Joints, skinning weights, pose correctives and regions of the built-in head."""
 
 from __future__ import annotations
 
@@ -20,26 +20,36 @@ JOINTS_AT = np.array(
     [(0.0, -0.165, -0.045), (0.0, -0.120, -0.035), (0.0, -0.002, -0.030), form.EYE, form.EYE * MIRROR_X]
 )
 """Root, neck, jaw, left eye, right eye [m]."""
+JOINT_REACH = 0.05
+"""Width of the bell of vertices from which a joint is regressed [m]."""
 
 
 def both_sides(mesh: HeadMesh, group: str) -> Array:
-    """Ids of a group of the left half and of its mirror image."""
+    """Return the vertex ids of a group of the left half and of its mirror image, ascending."""
     ids = mesh.groups[group]
     return np.unique(np.concatenate([ids, mesh.mirror[ids]]))
 
 
+def _ear_ids(mesh: HeadMesh) -> Array:
+    """Return the vertex ids of both ears."""
+    rings = [name for name in mesh.groups if name.startswith("ear_")]
+    return np.concatenate([both_sides(mesh, name) for name in rings])
+
+
 def _neighbours(mesh: HeadMesh) -> csr_matrix:
-    """Inverse edge lengths between neighbours, symmetric, shape [V, V]."""
-    edges = np.unique(np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    """Return the inverse edge lengths between neighbours, symmetric, shape [V, V]."""
+    sides = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edges = np.unique(np.sort(sides, axis=1), axis=0)
     weight = 1.0 / np.linalg.norm(mesh.verts[edges[:, 0]] - mesh.verts[edges[:, 1]], axis=1)
     rows, cols = np.concatenate([edges, edges[:, ::-1]]).T
     return coo_matrix((np.tile(weight, 2), (rows, cols)), shape=(len(mesh.verts),) * 2).tocsr()
 
 
 def jaw_share(mesh: HeadMesh) -> Array:
-    """How much each vertex follows the jaw: a harmonic field on the skin between chin and skull, smoothed, [V].
+    """Return the share of the jaw's motion in that of each vertex, 0..1, shape [V].
 
-    The mouth is a hole of the mesh, so that the field jumps across it and nowhere else.
+    It is 1 on the chin, 0 on the skull, and harmonic between: each vertex has the weighted mean of its neighbours, so
+    that the field has no other extremes and no creases. The mouth is a hole of the skin: only there does it jump.
     """
     x, y, z = np.abs(mesh.rest[:, 0]), mesh.rest[:, 1], mesh.rest[:, 2]
     verts = mesh.verts
@@ -54,20 +64,23 @@ def jaw_share(mesh: HeadMesh) -> Array:
         (verts[:, 1] > form.MOUTH_Y + 0.0055) | (verts[:, 2] < 0.010) & (verts[:, 1] > form.MOUTH_Y - 0.004)
     )
     neighbours = _neighbours(mesh)
+    total = np.asarray(neighbours.sum(axis=1)).ravel()
     share = below.astype(float)
     free = ~(below | above) & ((mesh.part == "skin") | socket)
-    laplacian = diags(np.asarray(neighbours.sum(axis=1)).ravel()) - neighbours
+    # Harmonic: L share = 0 at the free vertices. ``share`` is still 0 there, so that neighbours @ share holds the known
+    # values alone, the right-hand side.
+    laplacian = diags(total) - neighbours
     share[free] = spsolve(laplacian[free][:, free].tocsc(), neighbours[free] @ share)
-    mean = diags(1.0 / np.asarray(neighbours.sum(axis=1)).ravel()) @ neighbours
+    mean = diags(1.0 / total) @ neighbours
     for _ in range(6):
         share = 0.5 * share + 0.5 * (mean @ share)
     share[mesh.part == "lower_teeth"], share[mesh.part == "upper_teeth"] = 1.0, 0.0
     share = np.clip(share, 0.0, 1.0)
-    return 0.5 * (share + share[mesh.mirror])
+    return 0.5 * (share + share[mesh.mirror])  # the solver's rounding is not symmetric
 
 
 def skinning_weights(mesh: HeadMesh, jaw: Array) -> Array:
-    """Weights of root, neck, jaw and eyes, shape [V, 5], rows sum to 1."""
+    """Return the weights of root, neck, jaw and both eyes, shape [V, 5]; rows sum to 1."""
     head = smoothstep(-0.168, -0.088, mesh.verts[:, 1] + 0.12 * (mesh.verts[:, 2] + 0.04))
     weights = np.zeros((len(mesh.verts), 5))
     weights[:, 0], weights[:, 1], weights[:, 2] = 1.0 - head, head * (1.0 - jaw), head * jaw
@@ -78,12 +91,22 @@ def skinning_weights(mesh: HeadMesh, jaw: Array) -> Array:
     return weights
 
 
-def _regress(verts: Array, joint: Array, support: Array, reach: float) -> Array:
-    """Positive weights of ``support`` that sum to 1 and reproduce ``joint``: a bell around it, tilted exponentially.
+def _regress(verts: Array, joint: Array, support: Array) -> Array:
+    """Return positive weights that sum to 1 and whose weighted mean of the vertices is the joint.
 
-    The tilt is the root of a convex problem, found by Newton's method.
+    They are a bell around the joint times exp(tilt . offset), normalized. The logarithm of their sum is convex in the
+    tilt; its gradient is the weighted mean of the offsets, its Hessian their covariance. Newton's method finds the
+    minimum, where the mean is zero; it exists if the joint lies inside the convex hull of its vertices.
+
+    Args:
+        verts: Vertices [m], shape [V, 3].
+        joint: The joint [m], shape [3].
+        support: True for the vertices that may have a weight, shape [V].
+
+    Returns:
+        Weights, shape [V].
     """
-    offset = (verts[support] - joint) / reach
+    offset = (verts[support] - joint) / JOINT_REACH
     bell = -0.5 * np.sum(offset**2, axis=1)
     tilt = np.zeros(3)
     for _ in range(30):
@@ -91,49 +114,54 @@ def _regress(verts: Array, joint: Array, support: Array, reach: float) -> Array:
         weight = np.exp(logit - logit.max())
         weight /= weight.sum()
         mean = weight @ offset
-        step = np.linalg.solve((offset * weight[:, None]).T @ offset - np.outer(mean, mean), mean)
-        tilt -= step / max(1.0, np.linalg.norm(step))
+        covariance = (offset * weight[:, None]).T @ offset - np.outer(mean, mean)
+        step = np.linalg.solve(covariance, mean)
+        tilt -= step / max(1.0, np.linalg.norm(step))  # at most 1: far from the minimum a full step overshoots
     row = np.zeros(len(verts))
     row[support] = weight
     return row
 
 
 def joint_regressor(mesh: HeadMesh) -> Array:
-    """Joints as weighted means of nearby vertices, shape [5, V]."""
+    """Return the joints as weighted means of nearby vertices, shape [5, V]."""
     skin = mesh.part == "skin"
     ears = np.zeros(len(mesh.verts), bool)
-    ears[np.concatenate([both_sides(mesh, g) for g in mesh.groups if g.startswith("ear_")])] = True
+    ears[_ear_ids(mesh)] = True
     x, y, z = np.abs(mesh.verts[:, 0]), mesh.verts[:, 1], mesh.verts[:, 2]
     sides = skin & ~ears & (x > 0.045) & (np.abs(y + 0.002) < 0.025) & (z < 0.025) & (z > -0.075)
-    supports = [skin & (np.abs(y - JOINTS_AT[j, 1]) < 0.022) for j in (0, 1)] + [sides]
+    root_section, neck_section = (skin & (np.abs(y - JOINTS_AT[j, 1]) < 0.022) for j in (0, 1))
     eye = mesh.part == "eye"
-    supports += [eye & (mesh.verts[:, 0] > 0), eye & (mesh.verts[:, 0] < 0)]
-    reaches = (0.05, 0.05, 0.05, 0.05, 0.05)
-    each = zip(JOINTS_AT, supports, reaches, strict=True)
-    return np.stack([_regress(mesh.verts, joint, np.flatnonzero(s), reach) for joint, s, reach in each])
+    left_eye, right_eye = eye & (mesh.verts[:, 0] > 0), eye & (mesh.verts[:, 0] < 0)
+    supports = (root_section, neck_section, sides, left_eye, right_eye)
+    rows = [_regress(mesh.verts, joint, support) for joint, support in zip(JOINTS_AT, supports, strict=True)]
+    return np.stack(rows)
 
 
-def pose_correctives(mesh: HeadMesh, jaw: Array) -> Array:
-    """Offsets for the elements of R - I of neck, jaw, left and right eye, row by row, shape [V, 3, 36] [m].
+def pose_correctives(mesh: HeadMesh) -> Array:
+    """Return offsets for the elements of R - I of neck, jaw, left and right eye, row by row, shape [V, 3, 36] [m].
 
-    Neck: the side it bends or turns to bulges, the throat thickens when the head nods. Jaw: the cheeks draw in and
-    the angle of the jaw stands out when it opens. Eyes: the lids follow the gaze.
+    The neck bulges on the side to which it bends or turns, and the throat thickens when the head nods. The cheeks draw
+    in and the angle of the jaw stands out when the jaw opens. The lids follow the gaze.
     """
     verts, skin = mesh.verts, mesh.part == "skin"
     normals = vertex_normals(verts, mesh.faces)
     out = np.zeros((len(verts), 3, 36))
 
     def bell(centre: tuple[float, float, float], width: tuple[float, float, float]) -> Array:
+        """Return a bell on the skin, centre and widths in mm, shape [V]."""
         offset = (verts - np.array(centre) / 1000.0) / (np.array(width) / 1000.0)
         return skin * np.exp(-np.sum(offset**2, axis=1))
 
     def odd(field: Array) -> Array:
+        """Return the field as an offset along the normals, its mirror image as one against them, shape [V, 3]."""
         return (field - field[mesh.mirror])[:, None] * normals
 
     side = bell((52, -125, -50), (26, 24, 34))
     strap = bell((36, -125, -24), (16, 34, 20))
     throat = bell((0, -106, -5), (42, 14, 30))
     nape = bell((0, -115, -108), (50, 22, 24))
+    # Element 3 i + j of a joint's nine is (R - I)[i, j]. To first order R - I is the cross product with the rotation
+    # vector r: R[2, 1] = -R[1, 2] = r_x, R[0, 2] = -R[2, 0] = r_y, R[1, 0] = -R[0, 1] = r_z.
     out[:, :, 3], out[:, :, 1] = -0.004 * odd(side), 0.004 * odd(side)  # roll
     out[:, :, 2], out[:, :, 6] = -0.003 * odd(strap), 0.003 * odd(strap)  # yaw
     out[:, :, 7] = ((0.005 * throat - 0.003 * nape)[:, None]) * normals  # nod
@@ -152,12 +180,12 @@ def pose_correctives(mesh: HeadMesh, jaw: Array) -> Array:
 
 
 def regions(mesh: HeadMesh) -> dict[str, Array]:
-    """Named vertex regions, shape [V] each, bool."""
+    """Return the named vertex regions, shape [V] each, bool."""
     verts, part = mesh.verts, mesh.part
     skin, left = part == "skin", verts[:, 0] > 0
     x, y, z = np.abs(mesh.rest[:, 0]), mesh.rest[:, 1], mesh.rest[:, 2]
     ears = np.zeros(len(verts), bool)
-    ears[np.concatenate([both_sides(mesh, g) for g in mesh.groups if g.startswith("ear_")])] = True
+    ears[_ear_ids(mesh)] = True
     boundary = np.zeros(len(verts), bool)
     boundary[both_sides(mesh, "rim")] = True
     neighbours = _neighbours(mesh)
@@ -165,7 +193,8 @@ def regions(mesh: HeadMesh) -> dict[str, Array]:
         boundary |= neighbours @ boundary.astype(float) > 0
     front = (z > -0.018 + 0.10 * np.clip(-0.05 - y, 0.0, 0.02)) & (y < 0.082) & (mesh.level < 12.6)
     lips = np.zeros(len(verts), bool)
-    lips[np.concatenate([both_sides(mesh, f"lip_{k}") for k in range(len(RED_RINGS))])] = True
+    for k in range(len(RED_RINGS)):
+        lips[both_sides(mesh, f"lip_{k}")] = True
     face, shoulders = skin & front & ~ears, skin & (mesh.level > 15.6)
     scalp = skin & ~front & ~ears & (y - 0.25 * (z + 0.05) > -0.01) & (mesh.level < 8.5)
     eye = part == "eye"

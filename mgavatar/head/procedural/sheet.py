@@ -1,7 +1,7 @@
-"""The sheet on which the procedural head's skin is triangulated, and the rings of points that its features follow.
+"""The sheet on which the built-in head's skin is triangulated, and the rings of points along its features.
 
-A sheet has coordinates (p, q), about in metres: p runs around the left half of the head from the front to the back,
-q from the bust rim up to the crown. Between rings, points of graded density are relaxed and triangulated.
+The sheet has coordinates (p, q), roughly in metres: p runs around the left half of the head from the front to the back,
+q from the bust rim up to the crown. Between the rings, points of graded density are relaxed and triangulated.
 """
 
 from __future__ import annotations
@@ -19,16 +19,21 @@ from mgavatar.head.procedural import surface as form
 Array = np.ndarray
 
 AROUND = 0.070
-"""Sheet metres per radian around the head."""
+"""Metres on the sheet per radian around the head."""
 P_BACK = np.pi * AROUND
+"""p of the back of the head."""
 N_LID, N_LIP, N_EAR = 30, 21, 28
+"""Number of points per ring around the eye, per half ring around the mouth, and per ring of the ear."""
 RED_RINGS = (1.0, 0.74, 0.48, 0.24, 0.07, 0.0)
-"""Where the rings of the red of the lips lie between its border and the opening."""
+"""Places of the rings in the red of the lips, from 1 at its border to 0 at the opening."""
 
 
 @lru_cache(maxsize=1)
 def levels() -> tuple[PchipInterpolator, PchipInterpolator, float, float]:
-    """q of a level, level of a q, q of the cap's edge and of the rim; q is 0 at the crown and falls."""
+    """Return the maps from level to q and from q to level, and q of the cap's edge and of the rim.
+
+    q is 0 at the crown and falls with the length of the paths down the head, that of the front half counted more.
+    """
     level = np.linspace(0.0, form.N_LEVELS - 1.0, 721)
     angles = np.linspace(0.0, np.pi, 9)
     paths = np.stack([form.base(np.full_like(level, a), level) for a in angles])
@@ -39,23 +44,23 @@ def levels() -> tuple[PchipInterpolator, PchipInterpolator, float, float]:
 
 
 def sheet_to_angles(sheet: Array) -> tuple[Array, Array]:
-    """Angle and level of points (p, q) of the sheet."""
+    """Return angle [rad] and level of points (p, q) of the sheet, shape [..., 2]."""
     return sheet[..., 0] / AROUND, levels()[1](sheet[..., 1])
 
 
 def front_to_sheet(xy: Array) -> Array:
-    """Points of the sheet that lie under these x and y of the face [m]."""
+    """Return the points (p, q) of the sheet at x and y of the featureless face [m], shape [..., 2]."""
     angle, level = form.invert_front(xy[..., 0], xy[..., 1])
     return np.stack([angle * AROUND, levels()[0](level)], axis=-1)
 
 
 def skin(sheet: Array) -> Array:
-    """Points of the skin [m] at points (p, q) of the sheet."""
+    """Return the points of the skin at points (p, q) of the sheet: shape [N, 2] to [N, 3] [m]."""
     return form.surface(*sheet_to_angles(sheet))
 
 
 def spacing(points: Array) -> Array:
-    """Wanted distance between neighbours [m] at points of the featureless head."""
+    """Return the wanted distance between neighbours at points of the featureless head: shape [..., 3] to [...] [m]."""
     x, y, z = np.abs(points[..., 0]), points[..., 1], points[..., 2]
     face = np.hypot(np.hypot(x / 1.0, (y + 0.018) / 1.25), np.minimum(z - 0.035, 0.0) / 0.9)
     coarse = 0.0039 + 0.0064 * form.smoothstep(0.035, 0.115, face)
@@ -65,7 +70,7 @@ def spacing(points: Array) -> Array:
 
 
 def strip(outer: Array, inner: Array, *, closed: bool) -> Array:
-    """Triangles between two rings of equal length that run counter-clockwise, the outer one first."""
+    """Return the triangles between two counter-clockwise rings of ids, shape [N] each; the first is the outer one."""
     n = len(outer)
     i = np.arange(n if closed else n - 1)
     j = (i + 1) % n
@@ -74,7 +79,7 @@ def strip(outer: Array, inner: Array, *, closed: bool) -> Array:
 
 
 def ring_stack(rings: list[Array], *, closed: bool) -> Array:
-    """Triangles of a stack of rings, given as ids from outside to inside; the last may be a single point."""
+    """Return the triangles of a stack of rings of ids, from outside to inside; the last may be a single point."""
     faces = [strip(a, b, closed=closed) for a, b in pairwise(rings) if len(b) > 1]
     if len(rings[-1]) == 1:
         ring = rings[-2]
@@ -83,7 +88,7 @@ def ring_stack(rings: list[Array], *, closed: bool) -> Array:
 
 
 def lid_rings() -> list[Array]:
-    """Rings around the left eye on the sheet, from the socket to the edge of the lids."""
+    """Return rings around the left eye, from the socket to the edge of the lids: x and y, shape [N_LID, 2] each [m]."""
     t = np.linspace(0.0, 2 * np.pi, N_LID, endpoint=False)
     c, s = np.cos(t), np.sin(t)
     tilt = 0.0012 * c
@@ -94,7 +99,7 @@ def lid_rings() -> list[Array]:
 
 
 def nose_lines() -> list[Array]:
-    """Lines on the sheet along the foot and the crest of the nose's underside, where the skin bends sharply."""
+    """Return lines along the foot and the crest of the nose's underside, where the skin bends sharply: x and y [m]."""
     lines = []
     for offset in (-0.0010, 0.0002, 0.0014):
         radius = 0.0063 + offset
@@ -106,23 +111,29 @@ def nose_lines() -> list[Array]:
 
 
 def _lip_border(t: Array) -> Array:
-    """The edge of the lips' red on the sheet: a half ring at the angles ``t``."""
+    """Return the border of the lips' red before the mouth is closed, a half ring at the angles ``t``: x and y [m]."""
     x = (form.MOUTH_HALF_WIDTH + 0.0024) * np.cos(t)
     red = form.lip_height(np.minimum(x, form.MOUTH_HALF_WIDTH + 0.0014), upper=np.sin(t) > 0)
     opening = form.mouth_opening(x)
     distance = red + opening
-    for _ in range(20):  # the fixed point of the squeeze that closes the sheet's mouth
+    # Closing the mouth squeezes the sheet by an amount that depends on the distance itself. The fixed point is the
+    # distance that the squeeze takes to the height of the red.
+    for _ in range(20):
         distance = red + opening * (1.0 - form.smoothstep(opening, form.MOUTH_BLEND, distance))
-    distance *= np.abs(np.sin(t)) > 1e-9
+    distance *= np.abs(np.sin(t)) > 1e-9  # the corner lies on the mouth line
     return np.stack([x, form.MOUTH_Y + np.sign(np.sin(t)) * distance], axis=1)
 
 
 def lip_rings() -> list[Array]:
-    """Half rings around the mouth on the sheet, counter-clockwise, from the cheek over the border to the opening."""
+    """Return half rings around the mouth, counter-clockwise, from the cheek over the border of the red to the opening.
+
+    Returns:
+        x and y before the mouth is closed, shape [N_LIP, 2] each [m].
+    """
     t = np.linspace(-np.pi / 2, np.pi / 2, N_LIP)
-    t[N_LIP // 2] = 0.0
+    t[N_LIP // 2] = 0.0  # exactly: the corner belongs to both lips
     c, s = np.cos(t), np.sin(t)
-    c[[0, -1]] = 0.0
+    c[[0, -1]] = 0.0  # exactly: both ends are welded to the right half
     x = form.MOUTH_HALF_WIDTH * c
     hole = np.stack([x, form.MOUTH_Y + np.sign(s) * form.mouth_opening(x)], axis=1)
     outer = np.stack([0.0365 * c, form.MOUTH_Y - 0.0010 + 0.0180 * s], axis=1)
@@ -132,9 +143,10 @@ def lip_rings() -> list[Array]:
 
 
 def graded_line(start: Array, end: Array) -> Array:
-    """Points between two ends of the sheet, spaced as :func:`spacing` asks, without the ends."""
+    """Return points of the sheet between two ends, without the ends, spaced as :func:`spacing` wants, shape [N, 2]."""
     fine = start + np.linspace(0.0, 1.0, 2001)[:, None] * (end - start)
     wanted = spacing(form.base(*sheet_to_angles(fine)))
+    # The integral of 1 / spacing counts the points up to each place; equal steps of it are the points.
     count = np.concatenate([[0.0], np.cumsum(np.linalg.norm(end - start) / 2000 / wanted[1:])])
     n = max(1, round(count[-1]))
     at = np.interp(np.arange(1, n) * count[-1] / n, count, np.linspace(0.0, 1.0, 2001))
@@ -142,23 +154,40 @@ def graded_line(start: Array, end: Array) -> Array:
 
 
 def _inside(points: Array, polygon: Array) -> Array:
-    """Whether points lie inside a closed polygon (even-odd rule)."""
+    """Return True for points inside a closed polygon (even-odd rule), shape [N]."""
     a, b = polygon, np.roll(polygon, -1, axis=0)
     x, y = points[:, 0, None], points[:, 1, None]
-    crosses = (a[:, 1] > y) != (b[:, 1] > y)
-    rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])
-    return (crosses & (x < a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0]))).sum(axis=1) % 2 == 1
+    # A ray towards +x crosses an edge whose ends lie on either side of it, if it meets the edge's line ahead.
+    spans = (a[:, 1] > y) != (b[:, 1] > y)
+    rise = np.where(b[:, 1] == a[:, 1], 1.0, b[:, 1] - a[:, 1])  # a level edge spans nothing
+    meets_at = a[:, 0] + (y - a[:, 1]) / rise * (b[:, 0] - a[:, 0])
+    return (spans & (x < meets_at)).sum(axis=1) % 2 == 1
 
 
 def _encroaches(points: Array, polygon: Array) -> Array:
-    """Whether points are so close to an edge of a polygon that Delaunay triangles would break it."""
+    """Return True for points so close to an edge of a polygon that a Delaunay triangulation may lose it, shape [N].
+
+    An edge is kept if the circle with the edge as its diameter holds no other point; 0.55 leaves a margin. The long
+    edge that closes a half ring runs along the middle of the head and need not be kept.
+    """
     a, b = polygon, np.roll(polygon, -1, axis=0)
     distance = np.linalg.norm(points[:, None] - (a + b) / 2, axis=-1)
-    return np.any(distance < 0.55 * np.linalg.norm(b - a, axis=1) * (np.linalg.norm(b - a, axis=1) < 0.012), axis=1)
+    length = np.linalg.norm(b - a, axis=1)
+    reach = 0.55 * length * (length < 0.012)
+    return np.any(distance < reach, axis=1)
 
 
 def _scatter(candidates: Array, wanted: Array, fixed: Array) -> Array:
-    """Points of ``candidates`` that keep their ``wanted`` distance from each other and from ``fixed``."""
+    """Select candidates that keep about their wanted distance from each other and from the fixed points.
+
+    Args:
+        candidates: Shape [C, 2]; earlier ones are preferred.
+        wanted: Wanted distance of each candidate from its neighbours, shape [C].
+        fixed: Shape [N, 2].
+
+    Returns:
+        The selected candidates, in their order, shape [K, 2].
+    """
     tree = cKDTree(candidates)
     alive = cKDTree(fixed).query(candidates)[0] > 0.75 * wanted
     kept = []
@@ -170,20 +199,23 @@ def _scatter(candidates: Array, wanted: Array, fixed: Array) -> Array:
 
 
 def fill(fixed: Array, holes: list[Array], candidates: Array, embed: Callable[[Array], Array]) -> tuple[Array, Array]:
-    """Points and triangles that fill a convex region of a plane around holes.
+    """Fill a convex region of a plane around holes with points and triangles.
 
     Args:
-        fixed: Points on the outline and on the holes' outlines, [N, 2].
-        holes: Closed outlines, [M, 2] each.
-        candidates: Points that may be used, [C, 2].
-        embed: Maps points of the plane to space, for spacing and evenness.
+        fixed: Points on the outline and on the holes' outlines, shape [N, 2].
+        holes: Closed outlines, shape [M, 2] each.
+        candidates: Points that may be used, shape [C, 2].
+        embed: Maps points of the plane to space, shape [P, 2] to [P, 3] [m]; spacing and evenness are measured there.
 
     Returns:
-        All points, the fixed ones first, [P, 2]; counter-clockwise triangles, [F, 3].
+        All points, the fixed ones first, shape [P, 2]; counter-clockwise triangles, shape [F, 3].
     """
 
     def in_hole(at: Array) -> Array:
-        return np.any([np.zeros(len(at), bool), *(_inside(at, hole) | _encroaches(at, hole) for hole in holes)], axis=0)
+        inside = np.zeros(len(at), bool)
+        for hole in holes:
+            inside |= _inside(at, hole) | _encroaches(at, hole)
+        return inside
 
     candidates = candidates[~in_hole(candidates)]
     points = np.concatenate([fixed, _scatter(candidates, spacing(embed(candidates)), fixed)])
@@ -196,8 +228,9 @@ def fill(fixed: Array, holes: list[Array], candidates: Array, embed: Callable[[A
         free = ~near & ~in_hole(moved) & (np.arange(len(points)) >= n)
         points[free] = moved[free]
     triangles = Delaunay(points).simplices
-    centres = points[triangles].mean(axis=1)
-    triangles = triangles[~np.any([np.zeros(len(centres), bool), *(_inside(centres, hole) for hole in holes)], axis=0)]
+    # Delaunay fills the convex hull: triangles in holes are removed, and flat ones along the straight outline.
+    for hole in holes:
+        triangles = triangles[~_inside(points[triangles].mean(axis=1), hole)]
     ab, ac = points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
     triangles[area < 0] = triangles[area < 0][:, ::-1]
@@ -205,8 +238,12 @@ def fill(fixed: Array, holes: list[Array], candidates: Array, embed: Callable[[A
 
 
 def _even_out(points: Array, embedded: Array) -> Array:
-    """Neighbours' mean in the plane, longer edges pulling harder."""
+    """Return the mean of each point's neighbours in the plane, shape [P, 2].
+
+    Edges weigh as much as they are longer in space than in the plane: the points become even in space.
+    """
     simplices = Delaunay(points).simplices
+    # Every side of every triangle in both directions, so an edge inside counts twice for either end.
     i, j = simplices[:, [0, 1, 2, 1, 2, 0]].ravel(), simplices[:, [1, 2, 0, 0, 1, 2]].ravel()
     weight = np.linalg.norm(embedded[i] - embedded[j], axis=1) / np.maximum(
         np.linalg.norm(points[i] - points[j], axis=1), 1e-9
@@ -216,7 +253,13 @@ def _even_out(points: Array, embedded: Array) -> Array:
 
 
 def hexagons(low: Array, high: Array, pitch: float) -> Array:
-    """A lattice of points strictly inside a box."""
+    """Return a hexagonal lattice of points strictly inside a box, shape [N, 2].
+
+    Args:
+        low: Lower corner, shape [2].
+        high: Upper corner, shape [2].
+        pitch: Distance of neighbours.
+    """
     x = np.arange(low[0] + pitch, high[0] - 0.5 * pitch, pitch)
     y = np.arange(low[1] + pitch, high[1] - 0.5 * pitch, pitch * 0.8660254)
     grid = np.stack(np.meshgrid(x, y), axis=-1)

@@ -1,8 +1,8 @@
-"""The rest surface of the procedural head: horizontal sections, modelled features, and their inverse.
+"""The rest surface of the built-in head: horizontal sections, modelled features, and their inverse.
 
 The surface is a map from two coordinates to space. ``angle`` goes around the head (0 = front, pi/2 = the subject's
-left, pi = back); ``level`` goes down (0 = crown, ``N_LEVELS - 1`` = bust rim) through the named sections of
-``SECTIONS``. Everything is made for the left half, x >= 0; the right half is its mirror image. All lengths are metres.
+left, pi = back) [rad]; ``level`` goes down (0 = crown, ``N_LEVELS - 1`` = bust rim) through the rows of ``SECTIONS``.
+Only the left half, x >= 0, is modelled; the right half is its mirror image. All lengths are metres.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 EYE = np.array([0.031, 0.023, 0.024])
 """Centre of the left eyeball [m]."""
 EYE_RADIUS = 0.0118
+"""Radius of the eyeball [m]."""
 LID_RADIUS = 0.0134
+"""Radius of the sphere on which the lids lie [m]."""
 MOUTH_Y = -0.047
 MOUTH_HALF_WIDTH = 0.0255
 MOUTH_HALF_HEIGHT = 0.0045
-"""Half height of the mouth's opening on the sheet; on the closed lips it is squeezed to ``LIP_GAP``."""
+"""Half height of the mouth's opening on the sheet [m]; on the closed lips it is squeezed to ``LIP_GAP``."""
 MOUTH_BLEND = 0.0230
 """Distance from the mouth line at which the sheet is no longer squeezed [m]."""
 LIP_GAP = 0.00008
+"""Half the distance of the closed lips [m]."""
 
-# One row a section: front (z, y), side (x, z, y), back (z, y) [m], then how square the front is (2 = an ellipse).
+# One row per section: front (z, y), side (x, z, y), back (z, y) [m], then how square the front is (2 = an ellipse).
 SECTIONS = np.array(
     [
         # zf    yf       xs      zs      ys      zb      yb     square
@@ -49,7 +52,7 @@ SECTIONS = np.array(
 )
 N_LEVELS = len(SECTIONS)
 CAP_LEVEL = 2.6
-"""Above this level the head is triangulated, and unwrapped, as a cap."""
+"""Level above which the head is triangulated and unwrapped as a cap."""
 
 # Smooth bumps of the left half: centre (x, y, z), widths (x, y, z), displacement (x, y, z) [mm].
 BUMPS_MM = np.array(
@@ -115,13 +118,20 @@ _nose_pyramid = [PchipInterpolator(-NOSE_PYRAMID_MM[:, 0], NOSE_PYRAMID_MM[:, i]
 
 
 def smoothstep(low: float | np.ndarray, high: float | np.ndarray, value: np.ndarray) -> np.ndarray:
-    """0 below ``low``, 1 above ``high``, cubic between."""
+    """Interpolate from 0 below ``low`` to 1 above ``high`` with a cubic that is level at both ends."""
     s = np.clip((value - low) / (high - low), 0.0, 1.0)
     return s * s * (3.0 - 2.0 * s)
 
 
 def base(angle: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The head without features: a rounded section at each level, shape [..., 3]."""
+    """Return points of the head without features, shape [..., 3] [m].
+
+    Each section is a half ellipse behind and a half superellipse before its widest place.
+
+    Args:
+        angle: Angle around the head [rad], any shape.
+        level: Level, of the same shape.
+    """
     row = {name: spline(level) for name, spline in _splines.items()}
     c, s = np.cos(angle), np.sin(angle)
     n = np.where(c > 0, row["square"], 2.0)
@@ -132,7 +142,13 @@ def base(angle: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def invert_front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Angle and level of the points of the face whose base has these x and y [m] (Newton's method)."""
+    """Return angle and level of the points of the featureless face that have these x and y.
+
+    Args:
+        x: Coordinates [m], any shape.
+        y: Coordinates [m], of the same shape.
+    """
+    # Newton's method in two unknowns. The steps solve the 2 x 2 system of the Jacobian by Cramer's rule.
     angle, level = np.arcsin(np.clip(x / 0.075, -0.95, 0.95)), np.interp(-y, -SECTIONS[:, 1], np.arange(N_LEVELS))
     step = 1e-5
     for _ in range(12):
@@ -147,7 +163,7 @@ def invert_front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bumps(points: np.ndarray) -> np.ndarray:
-    """Add the smooth bumps of ``BUMPS_MM`` and their mirror images, shape [..., 3]."""
+    """Return points moved by the bumps of ``BUMPS_MM`` and by their mirror images, shape [..., 3]."""
     moved = points.copy()
     for centre, width, shift in BUMPS_MM / 1000.0:
         for side in (1.0, -1.0) if centre[0] else (1.0,):
@@ -158,6 +174,7 @@ def bumps(points: np.ndarray) -> np.ndarray:
 
 
 def _capsule(points: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return signed distances from a row of ``NOSE_MM``, a segment with a radius at either end, shape [...] [m]."""
     start, end, radii = (np.asarray(v, float) / 1000.0 for v in part)
     along = np.clip((points - start) @ (end - start) / np.sum((end - start) ** 2), 0.0, 1.0)
     nearest = start + along[..., None] * (end - start)
@@ -165,38 +182,39 @@ def _capsule(points: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def _soft_min(values: list[np.ndarray], width: float) -> np.ndarray:
+    """Return the smooth minimum of arrays; values that differ by less than about ``width`` are blended."""
     stack = np.stack(values)
-    low = stack.min(axis=0)
+    low = stack.min(axis=0)  # taken out of the exponentials, which then cannot overflow
     return low - width * np.log(np.exp(-(stack - low) / width).sum(axis=0))
 
 
 def nose_height(points: np.ndarray) -> np.ndarray:
-    """z of the outermost surface of face and nose above the points' x and y [m] (sphere tracing from the front)."""
+    """Return z of the face with its nose above the points' x and y, shape [...] [m]; sphere tracing from the front."""
     height, width = (spline(-points[..., 1] * 1000.0) / 1000.0 for spline in _nose_pyramid)
     floor = points[..., 2] + height * np.exp(-((np.abs(points[..., 0]) / width) ** 2.2))
     z = points[..., 2] + 0.045
     for _ in range(50):
         here = np.stack([np.abs(points[..., 0]), points[..., 1], z], axis=-1)
         parts = [_capsule(here, part) for part in NOSE_MM]
-        # Two widths: the nose's own parts run into each other sharply, the whole into the face softly.
+        # The parts of the nose are blended over a small width, the nose and the face over a larger one.
         z = z - 0.8 * _soft_min([(z - floor) * 0.8, _soft_min(parts, 0.0013)], 0.0022)
     return np.maximum(z, floor)
 
 
 def lid_height(points: np.ndarray, *, width: float = 0.0016) -> np.ndarray:
-    """z of the face where the lids lie on the eyeball [m]: the smooth maximum of the socket and a sphere."""
+    """Return z of the face with its lids, the smooth maximum of the socket and a sphere, shape [...] [m]."""
     across = np.hypot(np.abs(points[..., 0]) - EYE[0], points[..., 1] - EYE[1])
     sphere = np.sqrt(np.maximum(LID_RADIUS**2 - across**2, 0.0)) - 3.0 * np.maximum(across - LID_RADIUS, 0.0)
     return width * np.logaddexp((EYE[2] + sphere) / width, points[..., 2] / width)
 
 
 def mouth_opening(x: np.ndarray) -> np.ndarray:
-    """Half height of the mouth's opening on the sheet [m]."""
+    """Return half the height of the mouth's opening on the sheet at each x [m]."""
     return MOUTH_HALF_HEIGHT * np.maximum(1.0 - (x / MOUTH_HALF_WIDTH) ** 2, 0.0) ** 0.7
 
 
 def lip_height(x: np.ndarray, *, upper: np.ndarray) -> np.ndarray:
-    """Height of the red of the lips above and below the mouth line [m]."""
+    """Return the height of the red of the lips at each x [m]: of the upper lip where ``upper``, else of the lower."""
     ax = np.abs(x)
     taper = np.maximum(1.0 - (ax / (MOUTH_HALF_WIDTH + 0.0015)) ** 2, 0.0)
     bow = 1.0 + 0.16 * np.exp(-(((ax - 0.0055) / 0.004) ** 2)) - 0.10 * np.exp(-((ax / 0.0028) ** 2))
@@ -204,7 +222,7 @@ def lip_height(x: np.ndarray, *, upper: np.ndarray) -> np.ndarray:
 
 
 def _close_mouth(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from the mouth line and y [m] of points of the sheet after its mouth is closed."""
+    """Close the mouth of the sheet: return the distance of its points from the mouth line and their y [m]."""
     x, dy = points[..., 0], points[..., 1] - MOUTH_Y
     distance, opening = np.abs(dy), mouth_opening(x)
     from_line = np.maximum(distance - opening * (1.0 - smoothstep(opening, MOUTH_BLEND, distance)), 0.0)
@@ -215,7 +233,7 @@ def _close_mouth(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lips(points: np.ndarray) -> np.ndarray:
-    """Close the sheet's mouth and raise the lips; ``points`` are on the sheet, shape [..., 3]."""
+    """Return points of the sheet, shape [..., 3], with the mouth closed and the lips raised."""
     x, upper = points[..., 0], points[..., 1] >= MOUTH_Y
     from_line, y = _close_mouth(points)
     red = np.maximum(lip_height(x, upper=upper), 1e-4)
@@ -223,7 +241,7 @@ def _lips(points: np.ndarray) -> np.ndarray:
     fullness = np.where(upper, 0.0034, 0.0046) * np.clip(red / np.where(upper, 0.0072, 0.0092), 0.0, 1.2)
     roll = np.sqrt(np.clip(1.0 - (across - 0.45) ** 2 / 0.34, 0.0, 1.0))
     raised = fullness * np.where(across < 1.0, roll, 0.33 * np.exp(-1.6 * np.maximum(across - 1.0, 0.0)))
-    raised -= 0.0035 * np.exp(-((from_line / 0.0016) ** 2)) * (mouth_opening(x) > 0)  # turns inwards to the line
+    raised -= 0.0035 * np.exp(-((from_line / 0.0016) ** 2)) * (mouth_opening(x) > 0)  # the lips roll inwards
     corner = (np.abs(x) - MOUTH_HALF_WIDTH - 0.001) / 0.0045
     raised -= 0.0028 * np.exp(-(corner**2) - (from_line / 0.0050) ** 2)
     philtrum = smoothstep(0.007, 0.010, from_line) * (1.0 - smoothstep(0.015, 0.020, from_line)) * upper
@@ -235,7 +253,7 @@ def _lips(points: np.ndarray) -> np.ndarray:
 
 
 def _features(face: np.ndarray) -> np.ndarray:
-    """Lips, nose, lids and nostrils on points of the front of the head, shape [N, 3]."""
+    """Return points of the front of the head with lips, nose, lids and nostrils, shape [N, 3] [m]."""
     out = face.copy()
     mouth = (np.abs(out[:, 1] - MOUTH_Y) < MOUTH_BLEND) & (np.abs(out[:, 0]) < 0.04)
     out[mouth] = _lips(out[mouth])
@@ -253,7 +271,12 @@ def _features(face: np.ndarray) -> np.ndarray:
 
 
 def surface(angle: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The head's skin with all its features, shape [N, 3] [m]."""
+    """Return points of the skin with all its features, shape [N, 3] [m].
+
+    Args:
+        angle: Angle around the head [rad], shape [N].
+        level: Level, shape [N].
+    """
     points = bumps(base(angle, level))
     front = np.cos(angle) > 0.2
     points[front] = _features(points[front])
