@@ -11,15 +11,15 @@ import subprocess
 import sys
 import tomllib
 import zipfile
-from collections.abc import Iterator
-from graphlib import TopologicalSorter
 from importlib import resources
 from pathlib import Path
 
 import pytest
+from import_graph import FACE, LAYERS, import_graph, imports, layer_of, ordered, print_graph, source_files
 
 import mgavatar
 from mgavatar import cli
+from mgavatar.errors import DataError
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
@@ -45,43 +45,7 @@ POSIX_ONLY = {
 """Modules of Python's that Windows lacks."""
 
 
-def source_files() -> dict[str, Path]:
-    """Return the file of every installed module, by the module's name."""
-    folders = {
-        "mgavatar": ROOT / "mgavatar",
-        "mgavatar.kernels": ROOT / "kernels",
-        "mgavatar.configs": ROOT / "configs",
-    }
-    modules = {}
-    for package, folder in folders.items():
-        for path in folder.rglob("*.py"):
-            inside = path.relative_to(folder)
-            if package == "mgavatar" and inside.parts[0] in ("kernels", "configs"):
-                continue
-            name = ".".join([package, *inside.with_suffix("").parts]).removesuffix(".__init__")
-            modules[name] = path
-    return modules
-
-
 MODULES = source_files()
-
-
-def imports(path: Path, *, lazy: bool) -> Iterator[str]:
-    """Yield the modules that a file imports; without ``lazy``, only those that importing it imports."""
-    nodes: list[ast.AST] = [ast.parse(path.read_text("utf-8"))]
-    while nodes:
-        node = nodes.pop()
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield node.module
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        elif not lazy and (
-            isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-            or (isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING")
-        ):
-            continue
-        nodes += ast.iter_child_nodes(node)
 
 
 def test_the_packages_are_the_folders():
@@ -200,7 +164,8 @@ def test_no_dependency_and_no_extra_without_code_behind_it():
 def test_importing_needs_nothing_that_windows_lacks():
     """Modules that only POSIX has are imported where they are used, with another way out."""
     for name, path in MODULES.items():
-        assert not POSIX_ONLY & set(imports(path, lazy=False)), name
+        loaded = {imported.partition(".")[0] for imported in imports(path, lazy=False)}
+        assert not POSIX_ONLY & loaded, name
 
 
 def test_text_files_have_an_encoding():
@@ -244,15 +209,57 @@ def test_a_missing_encoding_is_found():
 
 
 def test_imports_point_one_way():
-    """No module imports, on the way or at once, one that imports it."""
-    graph = {
-        name: {other for other in imports(path, lazy=False) if other in MODULES and other != name}
-        for name, path in MODULES.items()
-    }
-    order = list(TopologicalSorter(graph).static_order())  # raises CycleError
-    assert order.index("mgavatar.geometry.stage") < order.index("mgavatar.fitting.fit") < len(order)
-    for name, others in graph.items():
-        if name.startswith("mgavatar.kernels"):
-            assert all(other.startswith("mgavatar.kernels") for other in others), name
-        if name.startswith("mgavatar.geometry"):
-            assert not any(other.startswith("mgavatar.appearance") for other in others), name
+    """No circle, and no layer imports from a later one, not even inside a function."""
+    graph = import_graph(MODULES)
+    order = ordered(graph)
+    assert len(order) == len(MODULES) - 1  # the face resolves its names when they are used
+    assert order.index("mgavatar.kernels.rasterize") < order.index("mgavatar.head.body")
+    assert order.index("mgavatar.geometry.stage") < order.index("mgavatar.fitting.fit")
+    assert {"mgavatar.head.body", "mgavatar.camera"} <= graph["mgavatar.avatar_file"]
+
+
+def test_the_face_imports_nothing_at_once():
+    """``import mgavatar`` is quick, and any module may import it."""
+    assert not [name for name in imports(MODULES[FACE], lazy=False) if name.startswith("mgavatar")]
+
+
+def test_every_layer_has_modules():
+    """A folder that is renamed is renamed among the layers too."""
+    filled = {layer_of(name) for name in MODULES if name != FACE}
+    assert filled == set(range(len(LAYERS)))
+    members = {name.split(".")[1] for name in MODULES if name != FACE}
+    assert members == {member for layer in LAYERS.values() for member in layer}
+
+
+@pytest.mark.parametrize(
+    ("graph", "words"),
+    [
+        ({"mgavatar.head.body": {"mgavatar.capture.subject"}}, "head.body imports mgavatar.capture.subject"),
+        ({"mgavatar.head.body": {"mgavatar.head.model"}, "mgavatar.head.model": {"mgavatar.head.body"}}, "a circle"),
+        ({"mgavatar.helpers": set()}, "mgavatar.helpers: belongs to no layer"),
+    ],
+)
+def test_imports_that_are_refused(graph, words):
+    """An arrow that points up, a circle within a layer, a module without a place."""
+    with pytest.raises(DataError, match=words):
+        ordered(graph)
+
+
+def test_imports_of_a_file(tmp_path):
+    """Imports inside functions count; a name is followed to the module that has it; relative ones are refused."""
+    (tmp_path / "a.py").write_text("import numpy\ndef f():\n    from mgavatar.b import c, d\n", "utf-8")
+    (tmp_path / "b.py").write_text("from mgavatar.b.c import d\n", "utf-8")
+    (tmp_path / "c.py").write_text("from . import d\n", "utf-8")
+    files = {"mgavatar.a": tmp_path / "a.py", "mgavatar.b": tmp_path / "b.py", "mgavatar.b.c": tmp_path / "b.py"}
+    graph = import_graph(files)
+    assert graph["mgavatar.a"] == {"mgavatar.b", "mgavatar.b.c"}
+    assert graph["mgavatar.b"] == {"mgavatar.b.c"}
+    with pytest.raises(DataError, match=r"c\.py, line 1: a relative import"):
+        list(imports(tmp_path / "c.py", lazy=True))
+
+
+def test_the_import_graph_is_printed():
+    """One line per module, with what it imports from nearer to the ground first."""
+    text = print_graph()
+    assert re.search(r"^    avatar +kernels\.rasterize, camera, ", text, re.MULTILINE)
+    assert text.index("\nground\n") < text.index("\nhead\n") < text.index("\ncommand line\n")
