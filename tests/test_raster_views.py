@@ -265,7 +265,7 @@ def test_a_change_of_the_views_in_place_is_noticed(device):
         out.backward()
 
 
-SHAPE = "viewmat has shape (2, 4, 4), so view_ids has to say each Gaussian's view"
+SHAPE = "viewmat has shape (2, 4, 4), so view_ids must give each Gaussian's view"
 REFUSALS: dict[str, dict[str, Any]] = {
     SHAPE: {"view_ids": None},
     "view_ids needs several views, but viewmat has shape (4, 4)": {
