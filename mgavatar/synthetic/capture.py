@@ -1,7 +1,7 @@
-"""Synthetic captures: ray-traced pictures of a person who is not in the head model, with exact geometry beside them.
+"""Synthetic captures: ray-traced images of a person whom the head model cannot express, with exact ground truth.
 
-They take the place of licensed data in trials, tests and the demo. The pictures come from a ray tracer and the motion
-from a float64 skinning of its own: no part of the method that is fitted to them made them.
+They replace licensed data in trials, tests and the demo. The images come from a ray tracer and the poses from a
+separate skinning in float64: no part of the method that is fitted to a capture takes part in making it.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ from mgavatar.synthetic.person import Person, make_person
 from mgavatar.synthetic.studio import Studio, front_camera, frontal_arc, held_out_camera, make_look, side_cameras
 
 _TURN = math.radians(20)
+"""Largest turn of the head to either side [rad]."""
 _N_SHAPE, _N_EXPR = 300, 100
-"""Sizes of VHAP's ``shape`` and ``expr``; more expression directions make ``expr`` longer."""
+"""Widths of VHAP's ``shape`` and ``expr``; ``expr`` is wider for a head model with more expression directions."""
 _SIDE_TIMESTEPS = 6
-"""The side cameras of a monocular capture see so many of the training timesteps."""
+"""Largest number of training timesteps that the side cameras of a monocular capture see."""
 
 
 def make_synthetic_capture(
@@ -49,28 +50,29 @@ def make_synthetic_capture(
     head: HeadModel | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Ray-trace a capture of a synthetic person in the VHAP / GaussianAvatars layout.
+    """Ray-trace a capture of a synthetic person in the layout of VHAP and GaussianAvatars.
 
-    The person has a drawn identity, hair, clothed shoulders far wider than the bust, and muscles that move, none of
-    which the tracked parameters contain: ``shape`` is zero, and the motion carries a tracker's errors. Training takes
-    the first 70 % of the timesteps; ``val`` is one camera near the front at those timesteps and ``test`` all cameras
-    at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The transforms files name the head
-    model. ``head_model.npz`` holds it unless it is the built-in one: do not pass on such a capture if the licence of
-    its head model forbids it. The same arguments write the same bytes.
+    The person has a random identity, hair, clothed shoulders far wider than the bust, and muscles that move. The
+    tracked parameters have none of them: ``shape`` is zero, and the motion has the errors of a tracker.
 
-    Of a monocular capture, training and ``test`` are what its one camera, number 0, sees of a head that turns 20
-    degrees to either side; ``val`` is what it does not see: cameras 1 and 2 stand 60 degrees to either side and look
-    at six of the training timesteps.
+    Training uses the first 70 % of the timesteps, ``val`` is one camera near the front at those timesteps, and ``test``
+    all cameras at the others. ``ground_truth/truth.npz`` holds the exact geometry and motion. The transforms files name
+    the head model, and ``head_model.npz`` holds it unless it is the built-in one: do not pass on such a capture if the
+    licence of its head model forbids it. The same arguments write the same bytes.
+
+    A monocular capture has one camera, number 0, for training and ``test``; it sees the head turn 20 degrees to either
+    side. Its ``val`` shows what that camera does not see, from cameras 1 and 2 at 60 degrees to either side, at six of
+    the training timesteps.
 
     Args:
         out: Folder to make; it must be new or empty.
-        cameras: Number of cameras on a frontal arc of two rows; a monocular capture has one.
-        timesteps: Number of frames of each camera.
+        cameras: Number of cameras, in two rows on a frontal arc; unused for a monocular capture.
+        timesteps: Number of frames per camera.
         size: Image width and height [px].
-        seed: Draws the person and the motion.
-        monocular: One camera that sees the head turn, and two more that only ``val`` has.
-        head: The model that carries identity and motion; the procedural head by default.
-        progress: Called with the number of images made and their total.
+        seed: Seed of the person and of the motion.
+        monocular: Make a monocular capture.
+        head: Head model of the identity and the motion; None is the built-in head.
+        progress: Called after each image with the number of images made and their total.
 
     Returns:
         ``out``.
@@ -117,10 +119,11 @@ def _check(out: Path, cameras: int, timesteps: int, size: tuple[int, int], *, mo
 
 
 Members = dict[Split, set[tuple[int, int]]]
-"""(timestep, camera) of the images of each split."""
+"""Timestep and camera of the images of each split."""
 
 
 def _splits(n_cameras: int, timesteps: int) -> Members:
+    """Hold out one camera for ``val`` and the last timesteps for ``test``."""
     n_train = _n_train(timesteps)
     every = {(t, c) for t in range(timesteps) for c in range(n_cameras)}
     test = {(t, c) for t, c in every if t >= n_train}
@@ -129,7 +132,7 @@ def _splits(n_cameras: int, timesteps: int) -> Members:
 
 
 def _monocular_splits(n_cameras: int, timesteps: int) -> Members:
-    """Camera 0 is the capture's own; the others show what it has not seen."""
+    """Use camera 0 for training and ``test``, the others for ``val``."""
     n_train = _n_train(timesteps)
     chosen = np.linspace(0, n_train - 1, min(_SIDE_TIMESTEPS, n_train)).round().astype(int).tolist()
     return {
@@ -151,13 +154,17 @@ def _shoot_all(
     members: Members,
     progress: Callable[[int, int], None] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Write all images and masks; return the vertices [T, V, 3] and how many training images see each [V]."""
+    """Write all images and masks.
+
+    Returns:
+        Vertices in world space [m], shape [T, V, 3], and the number of training images that see each, shape [V].
+    """
     (root / "images").mkdir()
     (root / "fg_masks").mkdir()
     vertices, seen = [], np.zeros(len(studio.verts), np.int16)
     every, done = set().union(*members.values()), 0
     saved: list[Future[None]] = []
-    with ThreadPoolExecutor(1) as writer:
+    with ThreadPoolExecutor(1) as writer:  # compresses an image while the next one is traced
         for t in range(len(motion)):
             studio.stage(motion, t)
             vertices.append(studio.verts.astype(np.float32))
@@ -171,7 +178,7 @@ def _shoot_all(
                 if progress is not None:
                     progress(done, len(every))
     for written in saved:
-        written.result()
+        written.result()  # raises what went wrong
     return np.stack(vertices), seen
 
 

@@ -1,4 +1,4 @@
-"""Shoulders and upper torso in a garment, grown around the bust of a head."""
+"""A garment over shoulders and upper torso, shaped around the bust of a head."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import torch
 from mgavatar.kernels.ray_cast import RayMesh
 
 _COLUMNS, _ROWS = 128, 80
+"""Number of vertices around the body, and from the collar to the hem."""
 _CLEARANCE = 0.005
-"""Distance of the cloth from the skin under it [m]."""
+"""Least distance of the cloth from the skin under it [m]."""
 
 # Along the cloth, from the collar (0) to the hem (1): height at the front, the side and the back, from the middle of
 # the eyes [m]; half the width; depth to the front and to the back of the neck's axis [m].
@@ -21,19 +22,20 @@ _WIDTH = np.array([0.058, 0.066, 0.095, 0.148, 0.190, 0.207, 0.205])
 _FRONT_Z = np.array([0.030, 0.036, 0.050, 0.066, 0.082, 0.094, 0.100])
 _BACK_Z = np.array([0.062, 0.068, 0.074, 0.086, 0.096, 0.102, 0.104])
 _AXIS_Z = -0.082
+"""z of the neck's axis, from the middle of the eyes [m]."""
 
 
 def drape(head: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cloth around a head's bust, outside of it everywhere.
+    """Make a garment around the bust of a head, outside of it everywhere.
 
     Args:
-        head: Vertices from the middle of the eyes [m], shape [V, 3].
+        head: Vertices relative to the middle of the eyes [m], shape [V, 3].
         faces: Vertex indices, shape [F, 3].
-        rng: Draws build and folds.
+        rng: Generator that draws build and folds.
 
     Returns:
-        Vertices from the middle of the eyes [m], shape [G, 3], faces [., 3], and how much each vertex belongs to the
-        collar, 0..1, shape [G].
+        Vertices relative to the middle of the eyes [m], shape [G, 3]; faces, shape [., 3]; and 1 on the collar, 0 off
+        it, smooth between, shape [G].
     """
     angle = np.arange(_COLUMNS) * (2 * np.pi / _COLUMNS)
     along = np.linspace(0.0, 1.0, _ROWS)[:, None]
@@ -49,6 +51,7 @@ def drape(head: np.ndarray, faces: np.ndarray, rng: np.random.Generator) -> tupl
 
 
 def _torso(along: np.ndarray, angle: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a torso of drawn build, shape [rows, columns, 3] [m], at places along it and angles from the front."""
     broad, deep = rng.uniform([0.94, 0.95], [1.06, 1.1])
     sine, cosine = np.sin(angle), np.cos(angle)
 
@@ -66,18 +69,21 @@ def _torso(along: np.ndarray, angle: np.ndarray, rng: np.random.Generator) -> np
 
 
 def _clear_of_body(cloth: np.ndarray, head: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Push the cloth away from the axis to where the body ends, smoothly, then a little further."""
+    """Push the cloth away from the axis, smoothly, until it is outside of the body."""
     mesh = RayMesh(torch.from_numpy(head.astype(np.float32)), torch.from_numpy(np.array(faces, np.int32)))
     arm = cloth - np.array([0.0, 0.0, _AXIS_Z])
     arm[..., 1] = 0.0
     radius = np.linalg.norm(arm, axis=-1, keepdims=True)
     arm /= radius
-    starts = cloth - arm * (radius - 0.6)
+    starts = cloth - arm * (radius - 0.6)  # 0.6 m from the axis: outside of any body, looking inwards
     depths, _, _ = mesh.cast(_rays(starts), _rays(-arm))
     body = 0.6 - depths.numpy().reshape(radius.shape).astype(np.float64)  # -inf where there is no body
     lack = np.maximum(body + _CLEARANCE - radius, 0.0)
+    # Smooth, but never below what is lacking: each place takes the mean of its four neighbours if that is more. The
+    # rows end at collar and hem, the columns go around.
     for _ in range(6):
-        padded = np.pad(np.pad(lack, ((1, 1), (0, 0), (0, 0)), mode="edge"), ((0, 0), (1, 1), (0, 0)), mode="wrap")
+        padded = np.pad(lack, ((1, 1), (0, 0), (0, 0)), mode="edge")
+        padded = np.pad(padded, ((0, 0), (1, 1), (0, 0)), mode="wrap")
         around = padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2]
         lack = np.maximum(lack, 0.25 * around)
     for row in range(1, _ROWS):  # below the end of the bust the cloth hangs down from it
@@ -86,11 +92,12 @@ def _clear_of_body(cloth: np.ndarray, head: np.ndarray, faces: np.ndarray) -> np
 
 
 def _rays(values: np.ndarray) -> torch.Tensor:
+    """Return origins or directions as the ray caster takes them, shape [N, 3], float32."""
     return torch.from_numpy(values.reshape(-1, 3).astype(np.float32))
 
 
 def _folds(along: np.ndarray, angle: np.ndarray, cloth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Creases that hang from the shoulders and pull towards the arms, and the thickness of the collar [m]."""
+    """Return the offsets of creases, which hang from the shoulders and pull towards the arms, and of the collar [m]."""
     phases = rng.uniform(0.0, 2 * np.pi, 4)
     x, y, _ = np.moveaxis(cloth, -1, 0)
     hanging = np.sin(52 * x + 22 * y + phases[0] + 1.5 * np.sin(17 * y + phases[1]))
@@ -102,6 +109,7 @@ def _folds(along: np.ndarray, angle: np.ndarray, cloth: np.ndarray, rng: np.rand
 
 
 def _grid_faces(rows: int) -> np.ndarray:
+    """Return two triangles per cell of a grid that is closed along its columns, shape [., 3]."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(_COLUMNS), indexing="ij")
     right = (column + 1) % _COLUMNS
     a, b = row * _COLUMNS + column, row * _COLUMNS + right

@@ -1,4 +1,4 @@
-"""What a synthetic person does in front of the cameras, and what a tracker would make of it."""
+"""The motion of a synthetic person, and the same motion with the errors of a tracker."""
 
 from __future__ import annotations
 
@@ -16,21 +16,25 @@ _ACTIONS = {
     "stretch": ("stretch",),
     "squint": ("squint", "cheekraise"),
 }
-"""What an action is called in the names of expression directions, without case and punctuation."""
+"""Words in the names of expression directions, without case and punctuation, that tell an action."""
 
 _REACH = {"smile": 0.9, "brows": 0.9, "blink": 1.0, "round": 0.6, "stretch": 0.5, "squint": 0.6}
+"""Largest coefficient of each action."""
 _LARGEST = 0.009
-"""No expression moves a vertex further than this [m], whatever the units of the model's directions; blinks may."""
+"""Largest motion of a vertex by a full expression [m], whatever the units of the directions; blinks have no limit."""
 
 
 def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: float) -> HeadParams:
-    """Smooth motion of ``timesteps`` frames: head turns and nods, speech, expressions, gaze, sway of the body.
+    """Make a smooth motion: turns and nods of the head, speech, expressions, gaze, sway of the body.
 
     Args:
-        head: The model whose expression directions are used.
+        head: Head model whose expression directions are used.
         timesteps: Number of frames, T.
-        rng: Draws phases.
-        turn: Largest turn of the head to a side [rad].
+        rng: Generator that draws the phases.
+        turn: Largest turn of the head to either side [rad].
+
+    Returns:
+        Parameters of T frames.
     """
     u = np.arange(timesteps) / max(timesteps - 1, 1)
     expr = _expressions(head, u, rng)
@@ -57,11 +61,18 @@ def perform(head: HeadModel, timesteps: int, rng: np.random.Generator, *, turn: 
 
 
 def tracked(motion: HeadParams, rng: np.random.Generator) -> HeadParams:
-    """Return a motion with a tracker's errors: 0.3 degrees, 0.5 mm and, where a direction is used, 0.03."""
+    """Add the errors of a tracker to a motion.
+
+    Their standard deviations are 0.3 degrees, 0.5 mm and, for expression directions in use, 0.03.
+
+    Args:
+        motion: The true motion.
+        rng: Generator that draws the errors.
+    """
     used = motion.expr.any(axis=0)
     sigmas = dict.fromkeys(MOTION_KEYS, np.radians(0.3)) | {"expr": 0.03 * used, "translation": 5e-4}
     noisy: dict[str, list[np.ndarray]] = {name: [] for name in MOTION_KEYS}
-    # Frame by frame: the order of the draws decides which capture a seed means.
+    # Frame by frame, not key by key: the order of the draws decides which capture a seed makes.
     for frame in range(len(motion)):
         for name in MOTION_KEYS:
             values = getattr(motion, name)[frame]
@@ -70,18 +81,25 @@ def tracked(motion: HeadParams, rng: np.random.Generator) -> HeadParams:
 
 
 def action_columns(head: HeadModel) -> dict[str, np.ndarray]:
-    """Expression directions of each action: by name or, where names say nothing, by the region that they move."""
+    """Return the columns of each action's expression directions, found by name, or else by the region that they move.
+
+    Args:
+        head: The head model.
+
+    Returns:
+        Columns within ``expr`` by action; actions without a direction are left out.
+    """
     names = ["".join(c for c in name.lower() if c.isalnum()) for name in head.expr_names]
-    found = {
-        action: np.array([i for i, name in enumerate(names) if any(word in name for word in words)], int)
-        for action, words in _ACTIONS.items()
-    }
-    found = {action: columns for action, columns in found.items() if len(columns)}
+    found = {}
+    for action, words in _ACTIONS.items():
+        columns = [column for column, name in enumerate(names) if any(word in name for word in words)]
+        if columns:
+            found[action] = np.array(columns, int)
     return found or _columns_by_region(head)
 
 
 def _columns_by_region(head: HeadModel) -> dict[str, np.ndarray]:
-    """The direction that is most concentrated in the mouth, in the brows and in the eyes."""
+    """Return the direction with the largest share of its motion in the mouth, in the brows and in the eyes."""
     motion = np.linalg.norm(head.shapedirs[:, :, head.n_shape :], axis=1)  # [V, E]
     points = head.v_template - (head.J_regressor @ head.v_template)[3:].mean(0)
     front = (points[:, 2] > -0.03) & vertex_regions(head)["skin"]
@@ -95,14 +113,15 @@ def _columns_by_region(head: HeadModel) -> dict[str, np.ndarray]:
     taken: dict[str, np.ndarray] = {}
     for action, box in boxes.items():
         share = (motion[box] ** 2).sum(0) / energy
-        share[[int(c[0]) for c in taken.values()]] = -1.0
+        for columns in taken.values():
+            share[columns] = -1.0  # a direction serves one action
         if len(share) > len(taken):
             taken[action] = np.array([int(np.argmax(share))])
     return taken
 
 
 def _expressions(head: HeadModel, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Coefficients over time, shape [T, n_expr]."""
+    """Return the coefficients at times ``u`` in 0..1, shape [T, n_expr]."""
     expr = np.zeros((len(u), head.n_expr))
     for i, (action, columns) in enumerate(action_columns(head).items()):
         phase = rng.uniform(0.0, 1.0)
@@ -115,5 +134,6 @@ def _expressions(head: HeadModel, u: np.ndarray, rng: np.random.Generator) -> np
 
 
 def _unit(head: HeadModel, column: int, action: str) -> float:
+    """Return the coefficient of a full expression: 1, or less where 1 moves a vertex further than ``_LARGEST``."""
     largest = float(np.linalg.norm(head.shapedirs[:, :, head.n_shape + column], axis=1).max())
     return 1.0 if action == "blink" else min(1.0, _LARGEST / max(largest, 1e-9))

@@ -1,4 +1,4 @@
-"""A person that the head model cannot express: an identity of the model with hair, a garment and muscles that move."""
+"""A person whom the head model cannot express: one of its identities with hair, a garment and muscles that move."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from mgavatar.head.mesh_math import vertex_normals
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import HeadParams
+from mgavatar.head.procedural.surface import smoothstep
 from mgavatar.head.subdivide import split_faces
 from mgavatar.synthetic.garment import drape
 
@@ -19,25 +20,26 @@ SKIN, EYE, TEETH, MOUTH, CLOTH = range(5)
 """Materials, numbered as in kernels/portrait.py."""
 
 _MIN_FACES = 30_000
-"""The head is subdivided until it has at least this many faces, for the sake of hair and silhouette."""
+"""Least number of faces of the head, for the sake of hair and silhouette."""
 _MAX_SUBDIVISIONS = 2
+"""Largest number of subdivisions that are made for it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """The surface of a synthetic person; head vertices come first, then the garment's.
+    """The surface of a synthetic person: H vertices of the head, then G of the garment.
 
     Attributes:
-        head: The model that carries the motion.
+        head: Head model that is posed.
         betas: True identity coefficients, shape [n_shape].
-        fine: Takes values of the model's vertices to the subdivided head, sparse, shape [H, V].
+        fine: Interpolates values of the model's vertices to the subdivided head, sparse, shape [H, V].
         faces: Vertex indices, shape [F, 3], int32.
         kinds: Material of each face, shape [F], int32.
-        hair: Rest offsets of the head's vertices that make the hair [m], shape [H, 3].
+        hair: Offsets of the head's vertices to the surface of the hair [m], shape [H, 3].
         garment: Rest vertices of the garment [m], shape [G, 3].
-        lbs_weights: Of all vertices, shape [H + G, 5].
-        rest: Resting point of each vertex in the template, from the middle of the eyes [m], shape [H + G, 3].
-        marks: Hair, lips, collar of each vertex, 0..1, shape [H + G, 3].
+        lbs_weights: Skinning weights of all vertices, shape [H + G, 5].
+        rest: Place of each vertex on the template, relative to the middle of the eyes [m], shape [H + G, 3].
+        marks: Shares of hair, lips and collar in each vertex, 0..1, shape [H + G, 3].
         masks: Named vertex regions, each shape [H + G], bool.
     """
 
@@ -54,10 +56,17 @@ class Person:
     masks: dict[str, np.ndarray]
 
     def posed(self, motion: HeadParams, frame: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return vertices in world space [m], [H + G, 3], and the rotation of each, [H + G, 3, 3], float64.
+        """Pose the person as in one frame of a motion.
 
-        FLAME's forward function (linear blend skinning about joints regressed from the shaped vertices), then muscles
-        and hair that follow the neck.
+        FLAME's forward pass (linear blend skinning about joints regressed from the shaped vertices), with muscles and
+        hair that follow the neck. It is independent of the kernels that a fit uses.
+
+        Args:
+            motion: Parameters of all frames.
+            frame: Row of the parameters.
+
+        Returns:
+            Vertices in world space [m], shape [H + G, 3], and the rotation of each, shape [H + G, 3, 3], float64.
         """
         shaped = shaped_vertices(self.head, self.betas, motion.expr[frame])
         neck_pose = motion.neck_pose[frame]
@@ -73,7 +82,7 @@ class Person:
         return verts, blended[:, :3, :3]
 
     def _correctives(self, neck_pose: np.ndarray) -> np.ndarray:
-        """Millimetres that skinning does not give, a smooth function of the neck's rotation, shape [H + G, 3] [m]."""
+        """Return offsets that skinning lacks, a smooth function of the neck's rotation, shape [H + G, 3] [m]."""
         pitch, yaw, roll = neck_pose
         x, y, z = self.rest.T
         side = np.tanh(x / 0.02)
@@ -84,17 +93,22 @@ class Person:
         out[:, 0] = bulge * side
         out[:, 1] = 0.018 * shrug * (np.abs(np.sin(yaw)) * 0.5 + np.maximum(side * np.sin(-roll), 0.0))
         out[:, 2] = np.abs(bulge) + 0.008 * shrug * np.sin(pitch)
-        sway = np.clip(np.linalg.norm(np.pad(self.hair, ((0, len(self.garment)), (0, 0))), axis=1) / 0.03, 0.0, 1.5)
+        hair = np.pad(self.hair, ((0, len(self.garment)), (0, 0)))
+        sway = np.clip(np.linalg.norm(hair, axis=1) / 0.03, 0.0, 1.5)  # thick hair swings further
         low = np.clip((0.06 - y) / 0.12, 0.0, 1.0) * sway
         out += low[:, None] * np.array([-0.016 * np.sin(yaw) + 0.012 * np.sin(roll), 0.0, -0.012 * np.sin(pitch)])
         return out
 
 
 def make_person(head: HeadModel, rng: np.random.Generator) -> Person:
-    """Draw identity, hair style and garment."""
+    """Draw a person: identity, hair style and garment.
+
+    Args:
+        head: Head model of the identity.
+        rng: Generator that draws the person.
+    """
     betas = 0.7 * np.clip(rng.standard_normal(head.n_shape), -2.0, 2.0)
-    neutral = np.zeros(head.n_expr)
-    shaped = shaped_vertices(head, betas, neutral)
+    shaped = shaped_vertices(head, betas, np.zeros(head.n_expr))
     fine, head_faces = subdivision(head.faces, len(shaped))
     eyes = (head.J_regressor.astype(np.float64) @ head.v_template)[3:]
     rest = fine @ (head.v_template - eyes.mean(0))
@@ -126,14 +140,14 @@ def make_person(head: HeadModel, rng: np.random.Generator) -> Person:
 
 
 def shaped_vertices(head: HeadModel, betas: np.ndarray, expr: np.ndarray) -> np.ndarray:
-    """Vertices with identity and expression, before pose correctives [m], shape [V, 3], float64."""
+    """Return vertices with identity and expression, before pose correctives [m], shape [V, 3], float64."""
     return head.v_template.astype(np.float64) + head.shapedirs.astype(np.float64) @ np.concatenate([betas, expr])
 
 
 def subdivision(faces: np.ndarray, n_verts: int) -> tuple[sp.csr_matrix, np.ndarray]:
     """Return midpoint subdivision as a sparse matrix, shape [H, V], and its faces, shape [F, 3].
 
-    A mesh with enough faces is not subdivided; the matrix is then the identity.
+    A mesh with enough faces is not subdivided: the matrix is then the identity.
     """
     fine = sp.identity(n_verts, format="csr")
     for _ in range(_MAX_SUBDIVISIONS):
@@ -152,7 +166,15 @@ def subdivision(faces: np.ndarray, n_verts: int) -> tuple[sp.csr_matrix, np.ndar
 
 
 def vertex_regions(head: HeadModel) -> dict[str, np.ndarray]:
-    """The model's masks; regions that it does not name are measured from skinning weights and positions."""
+    """Return the head's masks; regions that it does not name are derived from skinning weights and positions.
+
+    Args:
+        head: The head model.
+
+    Returns:
+        Masks of shape [V], bool, by name: those of the head, and at least ``eyeballs``, ``teeth``, ``lips``, ``ears``,
+        ``face``, ``scalp`` and ``skin``.
+    """
     points = head.v_template - (head.J_regressor @ head.v_template)[3:].mean(0)
     x, y, z = points.T
     regions = dict(head.masks)
@@ -172,7 +194,7 @@ def vertex_regions(head: HeadModel) -> dict[str, np.ndarray]:
 
 
 def _mouth_height(points: np.ndarray, jaw: np.ndarray, skin: np.ndarray) -> float:
-    """Where, at the front of the face, the skin stops following the skull and starts following the jaw [m]."""
+    """Return the height of the mouth line above the eyes [m]: between skin that follows the skull and the jaw."""
     front = skin & (np.abs(points[:, 0]) < 0.01) & (points[:, 2] > 0.015) & (points[:, 1] < -0.03)
     upper, lower = front & (jaw < 0.5), front & (jaw >= 0.5)
     if not upper.any() or not lower.any():
@@ -181,7 +203,7 @@ def _mouth_height(points: np.ndarray, jaw: np.ndarray, skin: np.ndarray) -> floa
 
 
 def hairline(around: np.ndarray) -> np.ndarray:
-    """Height of the hairline above the eyes [m] at an angle from the front [rad] about the skull's vertical axis."""
+    """Return the height of the hairline above the eyes [m] at angles from the front about the vertical axis [rad]."""
     degrees = [0, 25, 50, 66, 78, 88, 104, 116, 128, 150, 180]
     heights = [0.070, 0.069, 0.060, 0.030, -0.018, 0.018, 0.022, -0.02, -0.062, -0.082, -0.090]
     return np.interp(np.degrees(around), degrees, heights)
@@ -190,7 +212,18 @@ def hairline(around: np.ndarray) -> np.ndarray:
 def comb(
     rest: np.ndarray, shaped: np.ndarray, faces: np.ndarray, regions: dict[str, np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hair of a drawn style: its cover, 0..1, shape [H], and its offsets from the scalp [m], shape [H, 3]."""
+    """Draw a hair style.
+
+    Args:
+        rest: Vertices on the template, relative to the middle of the eyes [m], shape [H, 3].
+        shaped: The same vertices with the person's identity [m], shape [H, 3].
+        faces: Vertex indices, shape [F, 3].
+        regions: Named regions, 0..1, shape [H] each.
+        rng: Generator that draws the style.
+
+    Returns:
+        Share of hair in each vertex, 0..1, shape [H], and its offset from the scalp [m], shape [H, 3].
+    """
     top, side, fall, wave = rng.uniform([0.012, 0.009, 0.0, 1.5], [0.028, 0.022, 0.05, 6.0])
     fall = 0.0 if fall < 0.018 else fall  # short hair has no fall
     parting, phases = rng.uniform(-0.9, 0.9), rng.uniform(0.0, 2 * np.pi, 8)
@@ -200,31 +233,26 @@ def comb(
     line = hairline(np.abs(around)) + 0.0035 * np.sin(9 * around + phases[0])
     ears = np.clip(regions["ears"], 0.0, 1.0)
     grows = regions["skin"] * (1.0 - ears)
-    cover = _ramp(y - line, -0.005, 0.009) * grows
-    rise = _ramp(y - line, -0.004, 0.030) * cover
+    cover = smoothstep(-0.005, 0.009, y - line) * grows
+    rise = smoothstep(-0.004, 0.030, y - line) * cover
     clumps = _clumps(around, above, wave, phases)
-    thick = top * _ramp(y, 0.0, 0.09) + side * (1.0 - _ramp(y, 0.0, 0.09))
+    thick = top * smoothstep(0.0, 0.09, y) + side * (1.0 - smoothstep(0.0, 0.09, y))
     thick *= 1.0 - 0.35 * np.exp(-0.5 * ((around - parting) / 0.10) ** 2) * (np.abs(above) > 0.7)
     normals = vertex_normals(shaped, faces)
     outward = rest - np.array([0.0, 0.02, -0.065])
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     direction = 0.55 * normals + 0.45 * outward
     offsets = direction * (thick * rise * (0.72 + 0.45 * clumps))[:, None]
-    fringe = np.exp(-0.5 * (around / 0.75) ** 2) * _ramp(y, 0.045, 0.075) * cover
+    fringe = np.exp(-0.5 * (around / 0.75) ** 2) * smoothstep(0.045, 0.075, y) * cover
     sweep = 0.5 * top * np.array([0.25 * np.sign(parting), -0.35, 0.75])
     offsets += (fringe * (0.6 + 0.6 * clumps))[:, None] * sweep
-    hang = fall * cover * _ramp(-y, -0.05, 0.08) * _ramp(np.abs(around), 1.3, 2.1)
+    hang = fall * cover * smoothstep(-0.05, 0.08, -y) * smoothstep(1.3, 2.1, np.abs(around))
     offsets += hang[:, None] * (np.array([0.0, -1.0, 0.0]) + 0.35 * outward) * (0.8 + 0.4 * clumps)[:, None]
     return cover, offsets
 
 
-def _ramp(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    t = np.clip((x - low) / (high - low), 0.0, 1.0)
-    return t * t * (3.0 - 2.0 * t)
-
-
 def _clumps(around: np.ndarray, above: np.ndarray, wave: float, phases: np.ndarray) -> np.ndarray:
-    """Locks that run from the crown outwards, 0..1: ridges in the angle, bent by waves."""
+    """Return the height of locks that run from the crown outwards, 0..1: ridges in the angle, bent by waves."""
     bent = around + 0.12 * np.sin(wave * above + phases[1]) + 0.06 * np.sin(2.3 * wave * above + phases[2])
     ridges = np.abs(np.sin(7 * bent + phases[3] + 0.8 * np.sin(3 * bent + phases[4])))
     small = np.abs(np.sin(17 * bent + phases[5] + 2.0 * above))
@@ -232,6 +260,7 @@ def _clumps(around: np.ndarray, above: np.ndarray, wave: float, phases: np.ndarr
 
 
 def _materials(faces: np.ndarray, regions: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the material of each face, that of the region in which all its corners lie, shape [F]."""
     kinds = np.full(len(faces), SKIN)
     parts = {"mouth_socket": MOUTH, "mouth": MOUTH, "mouth_interior": MOUTH, "teeth": TEETH, "eyeballs": EYE}
     for name, kind in parts.items():
@@ -241,16 +270,19 @@ def _materials(faces: np.ndarray, regions: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _all_weights(fine: sp.csr_matrix, head: HeadModel, shaped: np.ndarray, garment: np.ndarray) -> np.ndarray:
-    """Skinning weights of head and garment; cloth near the neck moves with it, the rest with the body."""
+    """Return the skinning weights of head and garment, shape [H + G, 5].
+
+    Cloth near the skin follows the nearest vertex, the rest of it the root.
+    """
     weights = head.lbs_weights.astype(np.float64)
     distance, nearest = cKDTree(shaped).query(garment)
     near = np.exp(-np.maximum(distance - 0.006, 0.0) / 0.02)[:, None]
-    body = np.eye(5)[:1]
-    return np.concatenate([fine @ weights, near * weights[nearest] + (1.0 - near) * body])
+    root = np.eye(5)[:1]
+    return np.concatenate([fine @ weights, near * weights[nearest] + (1.0 - near) * root])
 
 
 def _joint_transforms(rotations: np.ndarray, joints: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """Rest to world of each joint, shape [5, 4, 4]."""
+    """Return the transform of each joint, from rest to world, shape [5, 4, 4]."""
     world: list[np.ndarray] = []
     for j, parent in enumerate(parents):
         local = np.eye(4)
@@ -258,5 +290,6 @@ def _joint_transforms(rotations: np.ndarray, joints: np.ndarray, parents: np.nda
         local[:3, 3] = joints[j] - (joints[parent] if parent >= 0 else 0.0)
         world.append(world[parent] @ local if parent >= 0 else local)
     stacked = np.stack(world)
+    # So far they map from the joint's own frame, whose origin is the joint: take the rest joint away first.
     stacked[:, :3, 3] -= np.einsum("jab,jb->ja", stacked[:, :3, :3], joints)
     return stacked

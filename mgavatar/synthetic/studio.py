@@ -1,4 +1,4 @@
-"""Pictures of a synthetic person: colours, cameras, open sky, and one ray-traced image."""
+"""Ray-traced images of a synthetic person: colours, cameras, ambient occlusion, one image."""
 
 from __future__ import annotations
 
@@ -18,16 +18,27 @@ from mgavatar.kernels.ray_cast import RayMesh, camera_rays
 from mgavatar.synthetic.person import Person
 
 _DISTANCE = 1.0
+"""Distance of the cameras from the target [m]."""
 _TARGET = np.array([0.0, -0.035, -0.02])
+"""Point in the centre of all images [m]."""
 _FIELD = 0.46
-"""Height or width of the scene that the shorter side of an image shows, at the target [m]."""
+"""Length at the target that the shorter side of an image covers [m]."""
 _FRONT_PITCH = -2.0
+"""Pitch of the front and the side cameras; a negative one looks down [deg]."""
 
 
 class Studio:
-    """A person before the cameras, one timestep at a time."""
+    """A person before the cameras, one timestep at a time.
+
+    Attributes:
+        person: The person.
+        look: Colours of the person.
+        mesh: The posed surface for ray casting.
+        verts: Its vertices in world space [m], shape [V, 3], float64.
+    """
 
     def __init__(self, person: Person, look: Look) -> None:
+        """Prepare a person in the neutral pose; ambient occlusion is computed there, once."""
         self.person = person
         self.look = look
         verts, _ = person.posed(HeadParams.neutral(n_frames=1, n_expr=person.head.n_expr), 0)
@@ -45,14 +56,21 @@ class Studio:
         self.verts = verts
 
     def stage(self, motion: HeadParams, frame: int) -> None:
-        """Pose the person as in one frame of a motion."""
+        """Pose the person as in one frame of a motion; images follow with :meth:`shoot`."""
         self.verts, rotations = self.person.posed(motion, frame)
         self.mesh.move(_tensor(self.verts))
         flow = np.einsum("vab,vb->va", rotations, self._flow)
         self._moving = (_tensor(vertex_normals(self.verts, self.person.faces)), _tensor(flow))
 
     def shoot(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Image on white and mask, uint8, shapes [H, W, 3] and [H, W]."""
+        """Ray-trace an image.
+
+        Args:
+            camera: Camera that sees the person as last staged.
+
+        Returns:
+            Image on white, shape [H, W, 3], and mask, shape [H, W], both uint8.
+        """
         left, top, right, bottom = self._bounds(camera)
         picture = np.zeros((camera.height, camera.width, 4), np.float32)
         n_pixels = (right - left) * (bottom - top)
@@ -65,7 +83,7 @@ class Studio:
         return image.astype(np.uint8), np.rint(255.0 * cover[..., 0]).astype(np.uint8)
 
     def seen(self, camera: Camera) -> np.ndarray:
-        """Whether a ray through a pixel's centre hits a triangle of each vertex, shape [V], bool."""
+        """Return True for vertices of triangles that rays through the centres of the pixels hit, shape [V], bool."""
         rays = camera_rays(torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K), camera.width, camera.height)
         _, face_ids, _ = self.mesh.cast(*rays)
         hit = np.unique(face_ids.numpy())
@@ -74,7 +92,7 @@ class Studio:
         return seen
 
     def _bounds(self, camera: Camera) -> tuple[int, int, int, int]:
-        """Pixels that the person's bounding box covers: left, top, right, bottom."""
+        """Return the pixels that the person's bounding box covers: left, top, right, bottom."""
         box = np.stack([self.verts.min(0), self.verts.max(0)])
         corners = np.stack(np.meshgrid(*box.T, indexing="ij"), axis=-1).reshape(-1, 3)
         points = corners @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
@@ -86,7 +104,12 @@ class Studio:
 
 
 def make_look(person: Person, rng: np.random.Generator) -> Look:
-    """Draw the colours of skin, hair, eyes and garment."""
+    """Draw the colours of skin, hair, eyes and garment.
+
+    Args:
+        person: The person.
+        rng: Generator that draws the colours.
+    """
     look = Look()
     tone = rng.uniform()
     light, dark = np.array([0.74, 0.43, 0.30]), np.array([0.22, 0.09, 0.045])
@@ -109,6 +132,7 @@ def make_look(person: Person, rng: np.random.Generator) -> Look:
     return look
 
 
+# Dark and light strands in linear RGB, from black to grey.
 _HAIR = (
     ((0.018, 0.012, 0.009), (0.075, 0.048, 0.032)),
     ((0.045, 0.022, 0.011), (0.17, 0.088, 0.045)),
@@ -120,10 +144,18 @@ _IRISES = ((0.10, 0.17, 0.27), (0.10, 0.17, 0.08), (0.085, 0.040, 0.018), (0.20,
 
 
 def open_sky(mesh: RayMesh, verts: np.ndarray, normals: np.ndarray, *, n_rays: int = 32) -> np.ndarray:
-    """Share of the sky that each vertex sees within a few centimetres (ambient occlusion), shape [V], 0..1."""
+    """Return the ambient occlusion of each vertex by what lies within 10 cm: 0 in a cleft, 1 in the open, shape [V].
+
+    Args:
+        mesh: The surface.
+        verts: Its vertices [m], shape [V, 3].
+        normals: Its unit vertex normals, shape [V, 3].
+        n_rays: Number of rays per vertex.
+    """
     spread = qmc.Sobol(2, scramble=False).random(n_rays) + 0.5 / n_rays
     radius, turn = np.sqrt(spread[:, 0]), 2 * np.pi * spread[:, 1]
-    local = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)])  # cosine-weighted
+    # Points of a disc, evenly spread and lifted to the hemisphere above it: directions with the density of the cosine.
+    local = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.sqrt(1 - radius**2)])
     helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     tangent = np.cross(helper, normals)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
@@ -136,7 +168,7 @@ def open_sky(mesh: RayMesh, verts: np.ndarray, normals: np.ndarray, *, n_rays: i
 
 
 def hair_flow(rest: np.ndarray) -> np.ndarray:
-    """Direction of the hair at each resting point: away from the crown, over the skull, shape [V, 3]."""
+    """Return the direction of the hair at points of the template: over the skull, away from the crown, shape [V, 3]."""
     arm = rest - np.array([0.0, 0.02, -0.075])
     arm /= np.linalg.norm(arm, axis=1, keepdims=True)
     down = np.array([0.0, -1.0, 0.0])
@@ -145,7 +177,12 @@ def hair_flow(rest: np.ndarray) -> np.ndarray:
 
 
 def frontal_arc(cameras: int, size: tuple[int, int]) -> list[Camera]:
-    """Two rows of cameras around the face, looking down and up; camera 8, or the last, stands near the front."""
+    """Return two rows of cameras around the face, one looking down and one up; the held-out one is near the front.
+
+    Args:
+        cameras: Number of cameras.
+        size: Image width and height [px].
+    """
     upper = -(-cameras // 2)
     places = [(yaw, -13.0) for yaw in np.linspace(-60, 60, upper)]
     places += [(yaw, 9.0) for yaw in np.linspace(-52, 52, cameras - upper)] if cameras - upper > 1 else []
@@ -157,21 +194,22 @@ def frontal_arc(cameras: int, size: tuple[int, int]) -> list[Camera]:
 
 
 def held_out_camera(cameras: int) -> int:
-    """The camera that shows novel views: 8, as the field does, or the last."""
+    """Return the index of the camera of the split of novel views: 8, as in the field, or else the last."""
     return 8 if cameras > 8 else cameras - 1
 
 
 def front_camera(size: tuple[int, int]) -> Camera:
-    """The one camera of a monocular capture."""
+    """Return the one camera of a monocular capture; ``size`` is width and height [px]."""
     return _camera(0.0, _FRONT_PITCH, size)
 
 
 def side_cameras(size: tuple[int, int]) -> list[Camera]:
-    """What the one camera of a monocular capture does not see: the head from 60 degrees to either side."""
+    """Return cameras 60 degrees to either side, which see what the one of a monocular capture does not see."""
     return [_camera(yaw, _FRONT_PITCH, size) for yaw in (-60.0, 60.0)]
 
 
 def _camera(yaw: float, pitch: float, size: tuple[int, int]) -> Camera:
+    """Return a camera on a sphere around the target, at these angles [deg]."""
     turn = Rotation.from_euler("YX", [yaw, pitch], degrees=True).as_matrix()
     focal = min(size) * _DISTANCE / _FIELD
     position = _TARGET + _DISTANCE * turn[:, 2]
@@ -179,6 +217,7 @@ def _camera(yaw: float, pitch: float, size: tuple[int, int]) -> Camera:
 
 
 def _view(camera: Camera, left: int, top: int, right: int) -> View:
+    """Return a camera as the ray tracer takes it, for the pixels right of ``left`` and below ``top``."""
     view = View()
     view.origin = wp.vec3(*camera.position)
     view.to_world = wp.mat33(*camera.viewmat[:3, :3].T.ravel())
