@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import os
-import re
+import pkgutil
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mgavatar.camera import look_at
+from mgavatar.capture import read, readers
 from mgavatar.capture.images import check_images, read_images, read_masks
 from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import SPLITS
@@ -76,12 +78,6 @@ def test_reads_what_was_written(root):
         np.testing.assert_array_equal(subject.params.neck_pose[3], content["neck_pose"][0])
         np.testing.assert_array_equal(subject.params.shape, content["shape"])
     assert subject.ground_truth is None
-
-
-def test_splits_of_the_reader_do_not_overlap(root):
-    subject = read_capture(root)
-    pairs = [(frame.timestep, frame.camera_id) for split in SPLITS for frame in subject.frames[split]]
-    assert len(set(pairs)) == len(pairs) == 12
 
 
 def test_val_and_test_may_be_missing_or_empty(tmp_path):
@@ -142,6 +138,48 @@ def test_static_offset_and_ground_truth(root):
     subject = read_capture(root)
     assert subject.params.static_offset.shape == (7, 3)
     assert subject.ground_truth == root.resolve() / "ground_truth/scan.npz"
+
+
+class OtherReader:
+    """A second format, to see that the entrance goes through all of them."""
+
+    MARK = "other.json"
+
+    def recognises(self, root: Path) -> bool:
+        return (root / self.MARK).exists()
+
+    def read(self, root: Path, **options: str) -> tuple[Path, dict[str, str]]:
+        return root, options
+
+
+def test_the_first_reader_that_recognises_a_folder_reads_it(tmp_path, monkeypatch):
+    """With its resolved path and the options; the message of an unknown folder names all marks."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/other.json").touch()
+    root = write_capture(tmp_path / "b")
+    refusal(lambda: read_capture(tmp_path / "a"), "a: no transforms_train.json in this folder; export the capture")
+    monkeypatch.setattr(read, "READERS", (*read.READERS, OtherReader()))
+    expected = (tmp_path / "a").resolve(), {"background": "black", "principal_point": "opengl"}
+    assert read_capture(tmp_path / "b/../a", background="black", principal_point="opengl") == expected
+    assert read_capture(root).root == root.resolve()
+    (root / "other.json").touch()
+    assert read_capture(root).root == root.resolve()
+    marks = "no transforms_train.json or other.json in this folder"
+    refusal(lambda: read_capture(tmp_path), f"{tmp_path}: {marks}; did you mean {tmp_path / 'a'}?")
+
+
+def test_every_reader_is_tried():
+    """No module of the folder is forgotten, and each keeps the interface."""
+    modules = {module.name for module in pkgutil.iter_modules(readers.__path__)}
+    assert {reader.__name__.rpartition(".")[2] for reader in read.READERS} == modules
+    for reader in read.READERS:
+        assert isinstance(reader.MARK, str)
+        assert list(inspect.signature(reader.recognises).parameters) == ["root"]
+        assert list(inspect.signature(reader.read).parameters) == ["root", "background", "principal_point"]
+
+
+def test_a_file_in_the_place_of_the_folder(root):
+    refusal(lambda: read_capture(root / "transforms_train.json"), "is a file, the folder of a capture is needed")
 
 
 def test_missing_folder(tmp_path):
@@ -244,17 +282,27 @@ def test_a_loop_of_links(root):
     refusal(lambda: read_capture(root), "frame images/00000_01.png", "cannot be opened")
 
 
-def test_overlapping_splits(root):
-    write_transforms(root, "test", frames_of(root, "train")[:1])
-    refusal(lambda: read_capture(root), "transforms_test.json", "transforms_train.json has already", "must not overlap")
+@pytest.mark.parametrize(("source", "target"), [("test", "val"), ("train", "test"), ("train", "val")])
+def test_splits_may_share_images(root, source, target):
+    """INSTA's exports have the end of ``test`` as ``val``; every split is read as its file says."""
+    write_transforms(root, target, frames_of(root, source)[-2:])
+    subject = read_capture(root)
+    pairs = {split: [(frame.timestep, frame.camera_id) for frame in subject.frames[split]] for split in SPLITS}
+    assert pairs[target] == pairs[source][-2:]
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_an_image_twice_in_one_split(root, split):
+    frames = frames_of(root, split)
+    write_transforms(root, split, [*frames, frames[0]])
+    label = frames[0]["file_path"]
+    refusal(lambda: read_capture(root), f"transforms_{split}.json: frame {label} is timestep", f"so is {label}; remove")
 
 
 def test_cameras_that_cannot_be_told_apart(root):
     for index in range(2):
         edit_frame(root, index=index, camera_index=None)
-    refusal(
-        lambda: read_capture(root), "transforms_train.json: frame images/00000_01.png", "told apart by camera_index"
-    )
+    refusal(lambda: read_capture(root), "transforms_train.json: frame images/00000_01.png", "apart by camera_index")
 
 
 def test_two_parameter_files_for_a_timestep(root):
@@ -413,12 +461,49 @@ def test_frames_without_masks(tmp_path):
     refusal(lambda: read_masks(subject.frames["train"]), "images/00000_00.png", "no foreground mask")
 
 
-def test_wrong_background_is_noticed(root, caplog):
+@pytest.mark.parametrize("masks", [True, False])
+@pytest.mark.parametrize(("stated", "actual"), [("black", "white"), ("white", "black")])
+def test_another_background_than_stated(tmp_path, stated, actual, masks):
+    """If all images are on the other one, it is refused with the flag that helps, which then works."""
+    root = write_capture(tmp_path / "subject", masks=masks)
+    if actual == "black":
+        for path in (root / "images").iterdir():
+            pixels = np.array(Image.open(path))
+            pixels[(pixels == 255).all(-1)] = 0
+            Image.fromarray(pixels).save(path)
+    words = ("subject: the images are on", "images/00000_00.png", f"give --background {actual}")
+    refusal(lambda: check_images(read_capture(root, background=stated)), *words)
+    check_images(read_capture(root, background=actual))
+
+
+@pytest.mark.parametrize(
+    ("color", "masks", "words"),
+    [
+        ((0, 0, 0), True, "or give --background black if"),
+        ((0, 0, 0), False, "or give --background black if"),
+        ((90, 120, 40), True, "composite them on it with their masks"),
+        ((90, 120, 40), False, None),
+    ],
+)
+def test_some_images_on_another_background(tmp_path, caplog, color, masks, words):
+    """A warning with a remedy; a room in an image without a mask is no fault."""
+    root = write_capture(tmp_path / "subject", masks=masks)
+    path = root / "images/00001_01.png"
+    pixels = np.array(Image.open(path))
+    pixels[(pixels == 255).all(-1)] = color
+    Image.fromarray(pixels).save(path)
     with caplog.at_level(logging.WARNING, logger="mgavatar"):
         check_images(read_capture(root))
-        assert not caplog.text
-        check_images(read_capture(root, background="black"))
-    assert re.search(r"12 of 12 images are not on the stated background \(RGB 0, 0, 0\)", caplog.text)
+    assert len(caplog.messages) == (words is not None)
+    for message in caplog.messages:
+        assert "1 of 12 images are not on the stated background (RGB 1, 1, 1), for example" in message
+        assert "00001_01.png" in message
+        assert words in message
+
+
+def test_an_unknown_background(root):
+    refusal(lambda: read_capture(root, background="grey"), "background 'grey': must be one of white, black")
+    refusal(lambda: read_capture(root, principal_point="middle"), "principal_point 'middle': must be one of center")
 
 
 VALUES = st.recursive(

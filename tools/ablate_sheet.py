@@ -42,7 +42,8 @@ def contact_sheet(captures: Mapping[Path, Sequence[tuple[str, Path]]]) -> np.nda
 def _block(data: Path, avatars: Sequence[tuple[str, Path]]) -> np.ndarray:
     """Draw one capture: a line of titles, then its rows."""
     loaded = Avatar.load(avatars[0][1])
-    subject = read_capture(data, principal_point=loaded.config.principal_point)
+    config = loaded.config
+    subject = read_capture(data, background=config.background, principal_point=config.principal_point)
     frames = [(split, frame) for split, count in _SHOWN.items() for frame in spread(subject.frames[split], count)]
     side = next((frame for _, frame in frames), subject.frames["train"][0])
     targets = [read_images([frame])[0].float() / 255.0 for _, frame in frames]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,7 +16,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from mgavatar.capture.subject import SPLITS, Frame, Subject
+from mgavatar.capture.subject import BACKGROUNDS, SPLITS, Frame, Subject
+from mgavatar.config import Background
 from mgavatar.errors import DataError
 from mgavatar.files import existing_file, one_line
 
@@ -71,32 +73,70 @@ def read_masks(frames: Sequence[Frame], *, size: tuple[int, int] | None = None, 
 def check_images(subject: Subject, *, threads: int = 2) -> None:
     """Decode every image and mask of every split once, so that a bad file is found before any work is done.
 
-    Logs a warning if the background of the images is not the one that ``subject`` states.
+    The background is looked up where a mask is empty, or in the upper corners of an image without a mask. Logs a
+    warning if that of some images is not the stated one.
 
     Raises:
-        DataError: For the first bad file, in the order of the splits and frames.
+        DataError: For the first bad file, in the order of the splits and frames, and if all images are on another
+            background than ``subject`` states.
     """
     frames = [frame for split in SPLITS for frame in subject.frames[split]]
-    off = np.zeros(len(frames), bool)
+    found: list[np.ndarray | None] = [None] * len(frames)
 
     def check(index: int) -> None:
-        frame = frames[index]
-        pixels = _read_image(frame)
-        if frame.mask_path is not None:
-            empty = _read_mask(frame)[..., 0] == 0
-            if empty.any():
-                off[index] = np.abs(np.median(pixels[empty], axis=0) / 255.0 - subject.background).max() > 0.1
+        found[index] = _background(frames[index])
 
     _for_all(check, len(frames), threads)
-    if off.any():
-        log.warning(
-            "%s: %d of %d images are not on the stated background (RGB %s), for example %s",
-            subject.root,
-            off.sum(),
-            len(frames),
-            ", ".join(f"{value:g}" for value in subject.background),
-            frames[int(off.argmax())].image_path,
+    _check_backgrounds(subject, frames, found)
+
+
+def _background(frame: Frame) -> np.ndarray | None:
+    """Return the colour behind the subject, RGB in 0..1, shape [3], or None where the subject covers everything."""
+    pixels = _read_image(frame)
+    if frame.mask_path is not None:
+        behind = pixels[_read_mask(frame)[..., 0] == 0]
+    else:
+        corner = max(1, pixels.shape[1] // 16)
+        behind = np.concatenate([pixels[:corner, :corner], pixels[:corner, -corner:]]).reshape(-1, 3)
+    return np.median(behind, axis=0) / 255.0 if len(behind) else None
+
+
+def _check_backgrounds(subject: Subject, frames: Sequence[Frame], found: Sequence[np.ndarray | None]) -> None:
+    """Refuse a capture that is on another background than stated; warn if only some of its images are.
+
+    Images without masks may show a room: of them only those on another known background count.
+    """
+    seen = [(frame, color) for frame, color in zip(frames, found, strict=True) if color is not None]
+    off = [(frame, _name_of(color)) for frame, color in seen if not _is_close(color, subject.background)]
+    off = [(frame, name) for frame, name in off if frame.mask_path is not None or name is not None]
+    if not off:
+        return
+    name, count = Counter(name for _, name in off).most_common(1)[0]
+    stated = ", ".join(f"{value:g}" for value in subject.background)
+    if name is not None and count == len(seen):
+        raise DataError(
+            f"{subject.root}: the images are on {name}, not on the stated background (RGB {stated}), for example "
+            f"{off[0][0].image_path}; give --background {name}"
         )
+    log.warning(
+        "%s: %d of %d images are not on the stated background (RGB %s), for example %s; composite them on it with "
+        "their masks%s",
+        subject.root,
+        len(off),
+        len(frames),
+        stated,
+        off[0][0].image_path,
+        "" if name is None else f", or give --background {name} if that is the background of the others",
+    )
+
+
+def _name_of(color: np.ndarray) -> Background | None:
+    """Return the name of a known background, or None for any other colour."""
+    return next((name for name, known in BACKGROUNDS.items() if _is_close(color, np.array(known))), None)
+
+
+def _is_close(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.abs(a - b).max() <= 0.1)
 
 
 def _for_all(work: Callable[[int], None], count: int, threads: int) -> None:

@@ -1,12 +1,33 @@
-"""Reading captures: find the reader that recognises a folder, and let it read."""
+"""Reading captures: the one entrance, which finds the reader that recognises a folder."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol, get_args
 
 from mgavatar.capture.readers import vhap
 from mgavatar.capture.subject import Subject
 from mgavatar.config import Background, PrincipalPoint
+from mgavatar.errors import DataError
+
+
+class Reader(Protocol):
+    """A format of captures; each module of :mod:`mgavatar.capture.readers` is one."""
+
+    MARK: str
+    """File that every folder in this format has, for messages."""
+
+    def recognises(self, root: Path) -> bool:
+        """Return True if a folder is a capture in this format, by the names of its files alone."""
+        ...
+
+    def read(self, root: Path, *, background: Background, principal_point: PrincipalPoint) -> Subject:
+        """Read a capture; as :func:`read_capture`."""
+        ...
+
+
+READERS: tuple[Reader, ...] = (vhap,)
+"""All formats, in the order in which they are tried."""
 
 
 def read_capture(
@@ -14,12 +35,12 @@ def read_capture(
 ) -> Subject:
     """Read a capture's calibration and parameters, and check that every file it names is there.
 
-    Images are not decoded: see ``mgavatar.capture.images.check_images``.
+    Images are not decoded: see :func:`mgavatar.capture.images.check_images`.
 
     Args:
         root: Folder with ``transforms_train.json``, and ``_val`` and ``_test`` if there are any. Paths in them are
             relative to it and may lead to its sibling folders, as in VHAP's combined (UNION) captures.
-        background: What the images are composited on; VHAP's default is white.
+        background: Colour that the images are composited on; VHAP's default is white.
         principal_point: ``"center"`` puts it into the image centre, as GaussianAvatars does; ``"opencv"`` takes
             ``cx, cy`` from the file, cy from the top; ``"opengl"`` the same with cy from the bottom, as VHAP writes
             it since November 2024.
@@ -28,6 +49,29 @@ def read_capture(
         The capture. Rows of its parameters are the timesteps of all splits in ascending order.
 
     Raises:
-        DataError: If something is missing or inconsistent; the message names the file.
+        DataError: If no reader recognises the folder, or something is missing or inconsistent; the message names the
+            file.
     """
-    return vhap.read(Path(root), background=background, principal_point=principal_point)
+    for name, value, choices in (
+        ("background", background, get_args(Background)),
+        ("principal_point", principal_point, get_args(PrincipalPoint)),
+    ):
+        if value not in choices:
+            raise DataError(f"{name} {value!r}: must be one of {', '.join(choices)}")
+    root = Path(root)
+    return _reader_of(root).read(root.resolve(), background=background, principal_point=principal_point)
+
+
+def _reader_of(root: Path) -> Reader:
+    """Return the first reader that recognises a folder."""
+    if not root.is_dir():
+        raise DataError(
+            f"{root}: {'is a file, the folder of a capture is needed' if root.exists() else 'no such folder'}"
+        )
+    for reader in READERS:
+        if reader.recognises(root):
+            return reader
+    inside = [folder for folder in sorted(root.glob("*/")) if any(reader.recognises(folder) for reader in READERS)]
+    remedy = f"did you mean {inside[0]}?" if inside else "export the capture with VHAP, or see mgavatar synth"
+    marks = " or ".join(reader.MARK for reader in READERS)
+    raise DataError(f"{root}: no {marks} in this folder; {remedy}")

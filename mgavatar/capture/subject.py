@@ -9,11 +9,15 @@ from typing import Literal
 import numpy as np
 
 from mgavatar.camera import Camera
+from mgavatar.config import Background
 from mgavatar.head.params import HeadParams
 
 Split = Literal["train", "val", "test"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
+
+BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""RGB in 0..1 of the backgrounds that captures are composited on."""
 
 
 @dataclass(frozen=True, eq=False)

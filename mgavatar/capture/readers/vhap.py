@@ -10,27 +10,31 @@ from pathlib import Path
 import numpy as np
 
 from mgavatar.camera import Camera
-from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
+from mgavatar.capture.subject import BACKGROUNDS, SPLITS, Frame, Split, Subject
 from mgavatar.capture.transforms import FrameReader, camera_of_frame
 from mgavatar.config import Background, PrincipalPoint
 from mgavatar.errors import DataError
 from mgavatar.files import float_array, one_line, read_json, read_npz
 from mgavatar.head.params import POSE_WIDTHS, HeadParams
 
-BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-
 PARAM_WIDTHS: dict[str, int | None] = {"expr": None, **POSE_WIDTHS}
 
 MAX_PARAM_BYTES = 64 << 20
 
+MARK = "transforms_train.json"
+
 log = logging.getLogger("mgavatar")
 
 
-def read(root: Path, *, background: Background = "white", principal_point: PrincipalPoint = "center") -> Subject:
+def recognises(root: Path) -> bool:
+    """Return True if a folder has the transforms file of a training split."""
+    return (root / MARK).exists()
+
+
+def read(root: Path, *, background: Background, principal_point: PrincipalPoint) -> Subject:
     """Read a capture in this layout; arguments, result and errors are those of ``read_capture``."""
-    root = _checked_root(root)
     entries = {split: list(_split_entries(root, split, principal_point)) for split in SPLITS}
-    _check_disjoint(entries, root)
+    _check_duplicates(entries, root)
     params_of = _params_of_timesteps(entries, root)
     timesteps = sorted(params_of)
     row_of = {timestep: row for row, timestep in enumerate(timesteps)}
@@ -42,20 +46,6 @@ def read(root: Path, *, background: Background = "white", principal_point: Princ
         background=np.array(BACKGROUNDS[background], np.float32),
         ground_truth=next(iter(sorted((root / "ground_truth").glob("*.npz"))), None),
     )
-
-
-def _checked_root(root: Path) -> Path:
-    if not root.is_dir():
-        raise DataError(
-            f"{root}: {'is a file, the folder of a capture is needed' if root.exists() else 'no such folder'}"
-        )
-    if not (root / "transforms_train.json").exists():
-        inside = sorted(path.parent.name for path in root.glob("*/transforms_train.json"))
-        remedy = (
-            f"did you mean {root / inside[0]}?" if inside else "export the capture with VHAP, or see mgavatar synth"
-        )
-        raise DataError(f"{root}: no transforms_train.json in this folder; {remedy}")
-    return root.resolve()
 
 
 @dataclass(frozen=True)
@@ -93,7 +83,7 @@ def _split_entries(root: Path, split: Split, principal_point: PrincipalPoint) ->
     if off_centre and principal_point == "center":
         log.warning(
             "%s: the principal point of %d frames is more than 1 %% off the image centre; it is put into the centre, "
-            "as GaussianAvatars does (see the principal point option)",
+            "as GaussianAvatars does; --principal-point opencv or opengl takes it from the file",
             path,
             off_centre,
         )
@@ -123,19 +113,22 @@ def _is_off_centre(reader: FrameReader) -> bool:
     return max(abs(cx - width / 2), abs(cy - height / 2)) > 0.01 * width
 
 
-def _check_disjoint(entries: dict[Split, list[_Entry]], root: Path) -> None:
-    """No image twice, in one split or in two: a score on a training image would mean nothing."""
-    seen: dict[tuple[int, int], _Entry] = {}
-    for entry in (entry for split in SPLITS for entry in entries[split]):
-        other = seen.setdefault((entry.timestep_id, entry.camera_id), entry)
-        if other is not entry:
-            remedy = (
-                "splits must not overlap" if other.split != entry.split else "cameras are told apart by camera_index"
-            )
-            raise DataError(
-                f"{root / f'transforms_{entry.split}.json'}: frame {entry.label} is timestep {entry.timestep_id} of "
-                f"camera {entry.camera_id}, which transforms_{other.split}.json has already ({other.label}); {remedy}"
-            )
+def _check_duplicates(entries: dict[Split, list[_Entry]], root: Path) -> None:
+    """Refuse a split that has an image twice.
+
+    Splits may share images: INSTA's exports have the last frames of ``test`` as ``val``, and images of ``train`` are
+    left out where the others are scored.
+    """
+    for split, own in entries.items():
+        seen: dict[tuple[int, int], _Entry] = {}
+        for entry in own:
+            first = seen.setdefault((entry.timestep_id, entry.camera_id), entry)
+            if first is not entry:
+                raise DataError(
+                    f"{root / f'transforms_{split}.json'}: frame {entry.label} is timestep {entry.timestep_id} of "
+                    f"camera {entry.camera_id}, and so is {first.label}; remove one of them, or tell their cameras "
+                    "apart by camera_index"
+                )
 
 
 def _params_of_timesteps(entries: dict[Split, list[_Entry]], root: Path) -> dict[int, Path]:
