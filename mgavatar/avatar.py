@@ -49,17 +49,17 @@ class Avatar:
 
     @property
     def head_model(self) -> HeadModel:
-        """Head model that the capture was tracked with."""
+        """Return the head model that the capture was tracked with."""
         return self.head.body.model
 
     @property
     def device(self) -> torch.device:
-        """Device of all tensors."""
+        """Return the device of all tensors."""
         return self.head.body.device
 
     @property
     def n_gaussians(self) -> int:
-        """Number of Gaussians."""
+        """Return the number of Gaussians."""
         return self.head.body.n_verts if self.appearance is None else len(self.appearance.gaussians)
 
     def mean_pose(self) -> Pose:

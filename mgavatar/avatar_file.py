@@ -49,6 +49,7 @@ class AvatarParts:
 
     @property
     def n_gaussians(self) -> int:
+        """Return the number of Gaussians."""
         return self.vertex_gaussians.head.body.n_verts if self.appearance is None else len(self.appearance.gaussians)
 
 

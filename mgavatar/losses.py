@@ -25,7 +25,7 @@ def _window(channels: int, dtype: torch.dtype, device: torch.device) -> tuple[Te
 
 
 def _blur(maps: Tensor) -> Tensor:
-    """The separable window over maps [C, H, W]; it is symmetric, so it is its own adjoint."""
+    """Convolve maps [C, H, W] with the separable window; it is symmetric, and so its own adjoint."""
     vertical, horizontal = _window(len(maps), maps.dtype, maps.device)
     maps = functional.conv2d(maps[None], vertical, padding=(5, 0), groups=len(maps))
     return functional.conv2d(maps, horizontal, padding=(0, 5), groups=maps.shape[1])[0]
@@ -56,23 +56,29 @@ class _Ssim(torch.autograd.Function):
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity, averaged over pixels and channels.
+    """Compute the structural similarity, averaged over pixels and channels.
 
-    Differentiable in ``image``. kornia's ``ssim_loss`` is half of 1 - SSIM and several times slower on a CPU, so the
-    paper's weight would not mean the same there.
+    Differentiable in ``image``. kornia's ``ssim_loss`` is half of 1 - SSIM, to which the paper's weight does not apply,
+    and several times slower on a CPU.
 
     Args:
-        image: In 0..1, shape [3, H, W].
-        target: Same shape.
+        image: Image in 0..1, shape [3, H, W].
+        target: Image of the same shape.
 
     Returns:
-        A scalar, 1 for equal images.
+        Scalar tensor, 1 for equal images.
     """
     return _Ssim.apply(image, target)
 
 
 def image_loss(image: Tensor, target: Tensor, config: ImageLossConfig) -> Tensor:
-    """Eq. 4: ``lambda_c |image - target| + lambda_m (1 - SSIM)``; images [3, H, W] in 0..1."""
+    """Compute the photometric loss of Eq. 4, ``lambda_c |image - target| + lambda_m (1 - SSIM)``.
+
+    Args:
+        image: Rendered image in 0..1, shape [3, H, W].
+        target: Image of the capture, of the same shape.
+        config: The weights.
+    """
     if image.device.type == "cpu" and image.dtype == torch.float32:
         absolute, similarity = compare_images(image, target)
         return config.color * absolute + config.ssim * (1.0 - similarity)

@@ -1,4 +1,4 @@
-"""How a long job tells what it does: a live line on a terminal, plain lines elsewhere, ``metrics.jsonl`` always."""
+"""Progress of long jobs: a live line on a terminal, plain lines elsewhere, and ``metrics.jsonl`` in both cases."""
 
 from __future__ import annotations
 
@@ -48,7 +48,13 @@ class Reporter:
             print(f"{self.title}: {self.total} done in {seconds:.0f} s", file=sys.stderr, flush=True)
 
     def update(self, done: int, note: str = "", *, total: int | None = None) -> None:
-        """Say that ``done`` of the total are done; a ``total`` takes the place of the one so far."""
+        """Show that ``done`` of the total are done.
+
+        Args:
+            done: Number that is done.
+            note: Text beside the numbers.
+            total: New total, if it has changed.
+        """
         self.total = self.total if total is None else total
         now = time.monotonic()
         rate = (done - self.first) / max(now - self.started, 1e-9)

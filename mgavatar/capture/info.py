@@ -1,4 +1,4 @@
-"""What an avatar remembers of the capture that it was fitted to."""
+"""Facts about the capture of an avatar that are stored with it."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from mgavatar.head.params import HeadParams
 
 @dataclass(frozen=True, eq=False)
 class CaptureInfo:
-    """What an avatar remembers of the capture that it was fitted to.
+    """Facts about a capture that are stored with its avatar.
 
     Attributes:
-        tracked: Parameters as the capture states them, all timesteps.
+        tracked: Tracked parameters of all timesteps.
         timestep_ids: The capture's own numbers of the timesteps.
-        train_timesteps: Rows that the fit has seen.
+        train_timesteps: Rows of the parameters that have training images.
         cameras: Training cameras by their index.
-        background: RGB, shape [3].
+        background: RGB in 0..1, shape [3].
     """
 
     tracked: HeadParams
@@ -31,6 +31,7 @@ class CaptureInfo:
 
     @staticmethod
     def of(subject: Subject) -> CaptureInfo:
+        """Collect the facts about a capture."""
         train = subject.frames["train"]
         cameras: dict[int, Camera] = {}
         for frame in train:
@@ -39,7 +40,7 @@ class CaptureInfo:
         return CaptureInfo(subject.params, subject.timestep_ids, seen, cameras, subject.background)
 
     def mean_camera(self) -> Camera:
-        """The training camera that is nearest to the middle of them all."""
+        """Return the training camera nearest to the mean position of all training cameras."""
         cameras = list(self.cameras.values())
         positions = np.stack([camera.position for camera in cameras])
         return cameras[int(np.argmin(((positions - positions.mean(0)) ** 2).sum(1)))]

@@ -19,16 +19,30 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class FrameReader:
-    """One frame of a transforms file: its values, else those at the top of the file, with messages that name both."""
+    """One frame of a transforms file: values of the frame, or else those at the top of the file.
+
+    Attributes:
+        path: The transforms file.
+        meta: Values at the top of the file.
+        values: Values of the frame.
+        label: Name of the frame in messages.
+        where: File and frame, with which messages begin.
+    """
 
     def __init__(self, path: Path, meta: dict[str, Any], frame: dict[str, Any], label: str) -> None:
         self.path, self.meta, self.values, self.label = path, meta, frame, label
         self.where = f"{path}: frame {label}"
 
     def has(self, key: str) -> bool:
+        """Return True if the frame or the top of the file has a value for a key."""
         return self.values.get(key) is not None or self.meta.get(key) is not None
 
     def number(self, key: str) -> float:
+        """Return a finite number.
+
+        Raises:
+            DataError: If it is missing or something else.
+        """
         value = self.values[key] if self.values.get(key) is not None else self.meta.get(key)
         if value is None:
             raise DataError(f"{self.where} has no {key}, and neither has the top of the file")
@@ -37,18 +51,38 @@ class FrameReader:
         return float(value)
 
     def whole(self, key: str, *, low: int, high: int = 10**8) -> int:
+        """Return a whole number from ``low`` to ``high``.
+
+        Raises:
+            DataError: If it is missing or something else.
+        """
         value = self.number(key)
         if value != int(value) or not low <= value <= high:
             raise DataError(f"{self.where}: {key} is {value:g}, a whole number from {low} to {high} is needed")
         return int(value)
 
     def file(self, key: str) -> Path:
+        """Return the path of an existing file in the capture's folder or in one beside it.
+
+        Raises:
+            DataError: If the entry is not such a file.
+        """
         where = f"{self.where}: {key}" if key != "file_path" else self.where
         return path_inside(self.values.get(key), base=self.path.parent, allowed=self.path.parent.parent, where=where)
 
 
 def camera_of_frame(reader: FrameReader, principal_point: PrincipalPoint) -> Camera:
-    """Camera-to-world in OpenGL axes (y up, z backwards) to world-to-camera in OpenCV axes, and the intrinsics."""
+    """Return the camera of a frame.
+
+    Transforms files have camera to world in OpenGL axes (y up, z backwards), cameras have world to camera in OpenCV's.
+
+    Args:
+        reader: The frame.
+        principal_point: Place of the principal point, as in ``read_capture``.
+
+    Raises:
+        DataError: If a value is missing or impossible.
+    """
     width, height = (reader.whole(key, low=1, high=MAX_PIXELS) for key in ("w", "h"))
     if width * height > MAX_PIXELS:
         raise DataError(f"{reader.where}: an image of {width}x{height} is too large")

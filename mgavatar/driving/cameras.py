@@ -23,10 +23,10 @@ MAX_SIDE = 8192
 
 
 def cameras_of(avatar: Avatar, camera: str, *, n_frames: int, size: tuple[int, int] | None = None) -> list[Camera]:
-    """The camera of every frame.
+    """Return the camera of every frame.
 
     Args:
-        avatar: The avatar, which knows its training cameras.
+        avatar: Avatar with its training cameras.
         camera: ``"mean"``, the training camera nearest to the middle of them all; ``"train:<id>"``; ``"orbit"``, one
             swing of the mean camera 40 degrees to both sides around the head; or the path of a ``.json`` with a frame
             of a VHAP transforms file: ``transform_matrix``, ``w``, ``h``, ``fl_x`` or ``camera_angle_x``. A file with
@@ -35,7 +35,7 @@ def cameras_of(avatar: Avatar, camera: str, *, n_frames: int, size: tuple[int, i
         size: Width and height [px] to fit the view into, or None.
 
     Returns:
-        One camera a frame.
+        One camera per frame.
 
     Raises:
         DataError: If there is no such camera.
@@ -67,13 +67,13 @@ def _train_camera(avatar: Avatar, name: str) -> Camera:
 
 
 def _orbit(avatar: Avatar, n_frames: int) -> list[Camera]:
-    """One swing of the mean camera to both sides of the head and back to its place."""
+    """Return one swing of the mean camera to both sides of the head and back to its place."""
     phases = np.arange(n_frames) / n_frames
     return turned_cameras(avatar, avatar.capture.mean_camera(), ORBIT_DEGREES * np.sin(2.0 * math.pi * phases))
 
 
 def turned_cameras(avatar: Avatar, camera: Camera, yaws: Iterable[float]) -> list[Camera]:
-    """A camera carried rigidly around the upright axis of the head in its mean pose, by each yaw [degrees]."""
+    """Turn a camera rigidly about the upright axis of the head in its mean pose, by each of the yaws [deg]."""
     pose = avatar.mean_pose()
     center = avatar.verts(pose).mean(dim=0).cpu().numpy().astype(np.float64)
     up = Rotation.from_rotvec(pose.rotation.numpy()).apply([0.0, 1.0, 0.0])
@@ -94,7 +94,7 @@ def _cameras_of_file(path: Path, n_frames: int, avatar: Avatar) -> list[Camera]:
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(f"{path}: frames must be a list of objects, as in a transforms file")
     if len(entries) not in (1, n_frames):
-        raise DataError(f"{path}: has {len(entries)} cameras for {n_frames} frames; give one, or one a frame")
+        raise DataError(f"{path}: has {len(entries)} cameras for {n_frames} frames; give one, or one per frame")
     cameras = [_camera_of_entry(path, meta, entry, index, avatar) for index, entry in enumerate(entries)]
     return cameras * n_frames if len(cameras) == 1 else cameras
 
@@ -107,7 +107,7 @@ def _camera_of_entry(path: Path, meta: dict[str, Any], entry: dict[str, Any], in
 
 
 def _fitted(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same view inside another image size, its proportions kept: what is added at two sides is further scene."""
+    """Fit a view into another image size; its proportions stay, and two sides show more of the scene."""
     width, height = size
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise DataError(f"--size {width}x{height}: both sides must lie between 1 and {MAX_SIDE} pixels")

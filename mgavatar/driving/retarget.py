@@ -18,21 +18,22 @@ ExpressionMode = Literal["use", "ignore", "auto"]
 def driving_expression(
     driving: Driving, *, n_expr: int, expr_basis: str, expr_names: tuple[str, ...], mode: ExpressionMode
 ) -> tuple[np.ndarray, str | None]:
-    """The expression coefficients of a driving sequence for a head: columns mean nothing on a head of another basis.
+    """Return the expression coefficients of a driving sequence for a head.
 
-    ``"use"`` takes the columns as they are, ``"ignore"`` none. ``"auto"`` matches them by name where both sides have
-    names; else takes them if the file's basis is the head's; else, for a file that does not say, if the head is FLAME
-    (the field's convention), or if the file was evidently made for the head: it ends in zeros where the head ends.
+    Columns of another basis have another meaning. ``"use"`` takes the columns as they are, ``"ignore"`` none.
+    ``"auto"`` matches them by name if both sides have names; else takes them if both have the same basis; else, if the
+    file names no basis, takes them if the head is FLAME's (the field's convention), or if the file was evidently made
+    for the head: its columns beyond the head's are zero.
 
     Args:
         driving: The motion.
         n_expr: Number of the head's expression directions.
         expr_basis: The head's basis.
         expr_names: Names of the head's directions, or an empty tuple.
-        mode: What to do.
+        mode: Treatment of the columns.
 
     Returns:
-        Coefficients, shape [T, n_expr], float32, and a line that says what was ignored, or None.
+        Coefficients, shape [T, n_expr], float32, and a note about ignored columns, or None.
     """
     nothing = np.zeros((len(driving), n_expr), np.float32)
     if mode == "ignore" or not driving.expr.any():
@@ -48,7 +49,7 @@ def driving_expression(
 
 
 def _mismatch(driving: Driving, n_expr: int, expr_basis: str) -> str | None:
-    """Why the file's expression columns cannot be assumed to mean what the head's do, or None."""
+    """Return the reason why the file's expression columns may mean others than the head's, or None."""
     if driving.expr_basis is not None:
         same = driving.expr_basis == expr_basis
         return None if same else f"its basis is {driving.expr_basis} and the head's is {expr_basis}"
@@ -93,7 +94,7 @@ HeadMotion = Literal["full", "neck", "none"]
 
 
 def driving_notes(avatar: Avatar, driving: Driving, *, expression: ExpressionMode = "auto") -> list[str]:
-    """Lines for the user: what of a driving sequence an avatar does not use."""
+    """List what an avatar does not use of a driving sequence, one line each."""
     note = _expression(avatar, driving, expression)[1]
     return [*driving.notes, *([note] if note else [])]
 
@@ -106,22 +107,24 @@ def poses_of(
     expression: ExpressionMode = "auto",
     frames: slice | None = None,
 ) -> list[Pose]:
-    """The avatar's poses under a driving sequence.
+    """Return the poses of an avatar under a driving sequence.
 
-    Rotations and expressions are taken as they are. ``"full"`` takes root and neck as driven, and moves the whole
-    sequence, which comes from another place, so that the head is on average where it was in training. ``"neck"``
-    keeps the shoulders where they were on average in training and turns the neck by what root and neck turn together,
-    so that the head looks where the driven one does. ``"none"`` keeps root and neck at their means in training.
+    Jaw, eyes and expressions are taken as they are. Root and neck depend on ``head_motion``:
+
+    * ``"full"`` takes both, and shifts the whole sequence so that the mean place of the head is that in training;
+    * ``"neck"`` keeps the shoulders at their mean in training and turns the neck by the driven root and neck together:
+      the head looks where the driven one does;
+    * ``"none"`` keeps both at their means in training.
 
     Args:
         avatar: The avatar.
         driving: The motion.
-        head_motion: As above.
-        expression: What to do with the expression columns.
-        frames: Which frames; all if None.
+        head_motion: Treatment of root and neck.
+        expression: Treatment of the expression columns, see :func:`driving_expression`.
+        frames: Frames to return; None returns all of them. Means are those of all frames in any case.
 
     Returns:
-        Poses on the CPU. The means are those of all frames, whatever ``frames`` says.
+        Poses on the CPU.
     """
     mean = avatar.mean_pose()
     expr = _expression(avatar, driving, expression)[0]
@@ -137,15 +140,24 @@ def poses_of(
         else:
             neck = np.broadcast_to(mean.neck_pose.numpy(), neck.shape)
         rotation = np.broadcast_to(mean.rotation.numpy(), rotation.shape)
+    chosen = frames or slice(None)
     columns = (expr, rotation, neck, driving.jaw_pose, driving.eyes_pose, translation)
-    tensors = [
-        torch.tensor(np.ascontiguousarray(column[frames or slice(None)]), dtype=torch.float32) for column in columns
-    ]
+    tensors = [torch.tensor(np.ascontiguousarray(column[chosen]), dtype=torch.float32) for column in columns]
     return [Pose(*row) for row in zip(*tensors, strict=True)]
 
 
 def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """A point inside the head, between neck joint and eyes, in each of T poses [m], shape [T, 3]."""
+    """Return the place of a point between neck joint and eyes in T poses.
+
+    Args:
+        avatar: The avatar.
+        rotation: Root rotation vectors [rad], shape [T, 3].
+        neck: Neck rotation vectors [rad], shape [T, 3].
+        translation: Translations [m], shape [T, 3].
+
+    Returns:
+        Points in world space [m], shape [T, 3].
+    """
     head = avatar.head
     with torch.no_grad():
         joints = head.joints(head.canonical()).cpu().numpy().astype(np.float64)
@@ -156,7 +168,7 @@ def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translat
 
 
 def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
-    """What moves the driven head's mean place to the avatar's own [m], shape [3]."""
+    """Return the shift from the mean place of the driven head to that of the avatar's own [m], shape [3]."""
     own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck_pose, mean.translation)))
     driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
     return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)

@@ -35,7 +35,11 @@ _PIXEL_SAMPLES = ((0.25, 0.25), (0.75, 0.25), (0.25, 0.75), (0.75, 0.75))
 
 
 def comparison(avatar: Avatar, subject: Subject, frame: Frame) -> np.ndarray:
-    """Capture, avatar, and their absolute difference times ``ERROR_GAIN``, side by side; [H, W, 3], uint8."""
+    """Draw a frame of the capture, the avatar, and their absolute difference times ``ERROR_GAIN`` side by side.
+
+    Returns:
+        Pixels, shape [H, W, 3], uint8.
+    """
     target = read_images([frame], threads=1)[0].float() / 255.0
     pose = evaluation_pose(avatar, subject, frame.timestep)
     image = avatar.render(pose, frame.camera).image.clamp(0.0, 1.0).cpu()
@@ -44,15 +48,17 @@ def comparison(avatar: Avatar, subject: Subject, frame: Frame) -> np.ndarray:
 
 
 def mesh_comparison(avatar: Avatar, subject: Subject, truth: tuple[Tensor, Tensor] | None) -> np.ndarray:
-    """The parametric start, the fitted mesh and, if known, the truth, coloured by normals; front above side.
+    """Draw the parametric head, the fitted mesh and, if it is known, the true surface, from the front and the side.
+
+    Colours show normals. The pose is that of the first training timestep.
 
     Args:
         avatar: The avatar.
-        subject: The capture that lends the pose: its first training timestep.
+        subject: The capture.
         truth: Vertices [m] and faces of the true surface at that timestep, or None.
 
     Returns:
-        Pixels [H, W, 3], uint8.
+        Pixels, shape [H, W, 3], uint8.
     """
     timestep = first_timestep(subject)
     faces = avatar.head.body.faces
@@ -68,19 +74,24 @@ def mesh_comparison(avatar: Avatar, subject: Subject, truth: tuple[Tensor, Tenso
 
 
 def first_timestep(subject: Subject) -> int:
+    """Return the first timestep with a training image."""
     return min(frame.timestep for frame in subject.frames["train"])
 
 
 @torch.no_grad()
 def start_verts(avatar: Avatar, subject: Subject, timestep: int) -> Tensor:
-    """Where the fit began: the parametric head in the tracked pose [m], shape [V, 3]."""
+    """Return the parametric head in the tracked pose, with which the fit began [m], shape [V, 3]."""
     body, shaped = avatar.head.body, tracked_shape(avatar)
     pose = subject.params.pose(timestep, n_expr=avatar.head_model.n_expr).to(avatar.device)
     return body.posed(shaped, pose, joints=avatar.head.joints(shaped))
 
 
 def normal_picture(verts: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
-    """A mesh with its smooth normals in camera axes as colours, on white; four rays a pixel; [H, W, 3], uint8."""
+    """Draw a mesh on white, coloured by its smooth normals in camera axes, with four rays per pixel.
+
+    Returns:
+        Pixels, shape [H, W, 3], uint8.
+    """
     device = verts.device
     samples = torch.tensor(_PIXEL_SAMPLES)
     viewmat = torch.from_numpy(camera.viewmat).to(device)
@@ -102,9 +113,12 @@ def normal_picture(verts: Tensor, faces: Tensor, camera: Camera) -> np.ndarray:
 
 
 def strip(avatar: Avatar, subject: Subject, driving: Sequence[Pose] | None) -> np.ndarray:
-    """Up to eight frames side by side: a driving sequence's, else the capture's held-out timesteps, from the front.
+    """Draw up to eight poses side by side: of a driving sequence, or else of the capture's held-out timesteps.
 
-    Few timesteps are shown from several sides each.
+    The view is the front; fewer poses are shown from several sides each.
+
+    Returns:
+        Pixels, shape [H, W, 3], uint8.
     """
     poses = list(driving) if driving is not None else _held_out_poses(avatar, subject)
     poses = list(spread(poses, STRIP_FRAMES))
@@ -128,7 +142,7 @@ def _of_height(camera: Camera, height: int) -> Camera:
 
 
 def at_most(pixels: np.ndarray, height: int) -> np.ndarray:
-    """A picture, reduced to ``height`` [px] if it is higher."""
+    """Return a picture, reduced to ``height`` [px] if it is higher."""
     if len(pixels) <= height:
         return pixels
     width = max(1, math.ceil(pixels.shape[1] * height / len(pixels)))
@@ -136,7 +150,7 @@ def at_most(pixels: np.ndarray, height: int) -> np.ndarray:
 
 
 def beside(panels: Sequence[np.ndarray]) -> np.ndarray:
-    """Panels of one height in a row with white gaps."""
+    """Join panels of one height in a row with white gaps."""
     gap = np.full((len(panels[0]), _GAP, 3), 255, np.uint8)
     row = [panels[0]]
     for panel in panels[1:]:

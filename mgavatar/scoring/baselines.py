@@ -1,4 +1,4 @@
-"""Predictors that know nothing of heads: what a score must beat before it means anything."""
+"""Naive baselines, which know nothing of heads: a score below theirs means nothing."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mgavatar.scoring.image_metrics import psnr
 _AT_ONCE = 16
 
 _ARM = 0.1
-"""How far from the head's centre rotations are felt [m]: a radian weighs as much as 0.1 m."""
+"""Length that makes angles comparable with distances [m]: a radian weighs as much as 0.1 m."""
 
 _EXPRESSION = 0.002
-"""What one unit of expression typically moves [m]."""
+"""Typical motion of the face by one unit of expression [m]."""
 
 
 class NaiveBaselines:
-    """White, the mean training image, and the nearest training image, each scored as an avatar is.
+    """A white image, the mean training image, and the nearest training image, scored in the same way as an avatar.
 
     The nearest image is that of the same camera in the nearest tracked pose, see :func:`pose_distances`. A camera that
     training lacks is replaced by the nearest one.
@@ -38,7 +38,15 @@ class NaiveBaselines:
         self._mean = lru_cache(maxsize=4)(self._mean_image)
 
     def scores(self, frame: Frame, target: Tensor) -> dict[str, float | None]:
-        """PSNR of each predictor for one image [dB]; None where there is nothing to predict with."""
+        """Return the PSNR of each baseline for one image.
+
+        Args:
+            frame: Frame of the image.
+            target: The image in 0..1, shape [3, H, W].
+
+        Returns:
+            PSNR by baseline [dB], None for a baseline without a training image to use.
+        """
         mean = self._mean(target.shape[2], target.shape[1])
         nearest = self.nearest_frame(frame)
         return {
@@ -48,7 +56,7 @@ class NaiveBaselines:
         }
 
     def nearest_frame(self, frame: Frame) -> Frame | None:
-        """The training frame that looks most like ``frame`` by camera and pose, or None for a training frame."""
+        """Return the training frame nearest to ``frame`` by camera and pose, or None if it is a training frame."""
         if frame in self._train:
             return None
         size = (frame.camera.width, frame.camera.height)
@@ -84,9 +92,16 @@ def _read_float(frame: Frame) -> Tensor:
 
 
 def pose_distances(params: HeadParams, timestep: int) -> np.ndarray:
-    """How far the head of a timestep is from those of all timesteps [m], shape [T].
+    """Measure the distances of one timestep's pose from those of all timesteps.
 
-    The sum of what root and neck together, jaw, translation and expression move.
+    A distance is the sum of the motions by root and neck together, by the jaw, by the translation and by expressions.
+
+    Args:
+        params: Parameters of T timesteps.
+        timestep: Row of the parameters.
+
+    Returns:
+        Distances [m], shape [T].
     """
     head = Rotation.from_rotvec(params.rotation) * Rotation.from_rotvec(params.neck_pose)
     turn = (head[timestep].inv() * head).magnitude()

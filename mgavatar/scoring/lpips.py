@@ -25,7 +25,7 @@ _LAYERS = (
 
 
 def weight_shapes() -> dict[str, tuple[int, ...]]:
-    """Names and shapes that a weights file must have: the state dict of ``lpips.LPIPS(net="vgg")``."""
+    """Return the names and shapes in a file of weights, the state dict of ``lpips.LPIPS(net="vgg")``."""
     shapes: dict[str, tuple[int, ...]] = {f"scaling_layer.{name}": (1, 3, 1, 1) for name in ("shift", "scale")}
     for index, block in enumerate(_LAYERS):
         for name, n_in, n_out in block:
