@@ -1,6 +1,7 @@
 """Hash features as a module, with an optimizer step that visits only the entries that have a gradient."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -186,9 +187,15 @@ class HashGrid(nn.Module):
         return HashEncode.apply(points, self.table, self._levels, self._table_gradient())
 
     def _table_gradient(self) -> TableGradient:
-        if self._owned is None or self._owned.values is not self._gradient:  # the module was moved
+        if self._owned is None:
             self._owned = TableGradient(self._gradient, self._marks)
         return self._owned
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "HashGrid":
+        """Drop the gradient's holder, whose buffers have moved; torch calls this for ``to`` and ``cuda``."""
+        super()._apply(fn, recurse)
+        self._owned = None
+        return self
 
     def table_gradient(self) -> Tensor:
         """Copy the gradient that waits for :meth:`adam_step`, shape [T, F]."""

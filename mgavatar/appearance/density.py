@@ -103,7 +103,9 @@ class DensityControl:
         return {"total": self.total, "seen": self.seen, "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.total, self.seen = state["total"], state["seen"]
+        """Continue from a ``state_dict`` of any device, which is copied."""
+        device = self.gaussians.face_ids.device
+        self.total, self.seen = (state[name].to(device, copy=True) for name in ("total", "seen"))
         self.generator.set_state(state["generator"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -20,7 +21,7 @@ from mgavatar.head.params import Pose
 from mgavatar.kernels.binding import bind_to_faces, directions_on_faces
 from mgavatar.kernels.face_frames import gather_matrix
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
-from mgavatar.kernels.uv_map import position_map, uv_map, uv_sampler
+from mgavatar.kernels.uv_map import UvMap, position_map, uv_map, uv_sampler
 
 _CACHED_POSES = 256
 
@@ -62,11 +63,24 @@ class FrozenHead:
         """Diagonal of the canonical head [m]: the yardstick of density control."""
         vt, ft = torch.tensor(fine.vt, device=device), torch.tensor(fine.ft, dtype=torch.int32, device=device)
         self.face_vt = vt[ft.long()]
-        self._uv = None
+        self._uv: UvMap | None = None
         self.canonical_map = torch.zeros(3, 0, 0, device=device)
         if uv_resolution is not None:
             self._uv = uv_map(vt, ft, self.body.faces, self.body.n_verts, uv_resolution, uv_resolution)
             self.canonical_map = self._map(self.canonical)
+        self.forget_poses()
+
+    def move(self, fn: Callable[[Tensor], Tensor]) -> None:
+        """Apply ``fn``, such as a move to another device, to every tensor of the head."""
+        self.head._apply(fn)
+        self.canonical, self.low, self.high = fn(self.canonical), fn(self.low), fn(self.high)
+        self.frames = FaceFrames(*(fn(tensor) for tensor in self.frames.all))
+        self.face_vt, self.canonical_map = fn(self.face_vt), fn(self.canonical_map)
+        self._uv = self._uv.to(self.canonical.device) if self._uv is not None else None
+        self.forget_poses()
+
+    def forget_poses(self) -> None:
+        """Drop the posed meshes that are kept; call it when the head's poses have changed."""
         self._posed: OrderedDict[int, PosedMesh] = OrderedDict()
 
     def _map(self, verts: Tensor) -> Tensor:
@@ -121,6 +135,13 @@ class Appearance(nn.Module):
         self._forget()
         self.register_load_state_dict_post_hook(lambda module, _: module._forget())
         self.rebind()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Appearance:
+        """Move the head with the parameters, although it is no part of them; torch calls this for ``to``."""
+        super()._apply(fn, recurse)
+        self.frozen.move(fn)
+        self._forget()
+        return self
 
     def _forget(self) -> None:
         """Drop what was prepared for the Gaussians' faces and texture coordinates, because they have changed."""

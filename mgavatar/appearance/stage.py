@@ -133,6 +133,7 @@ class AppearanceStage:
             self._resize(state["n"])
         self.appearance.load_state_dict(state["appearance"])
         self.poses.load_state_dict(state["poses"])
+        self.appearance.frozen.forget_poses()
         self.optimizer.load_state_dict(state["optimizer"])
         self.density.load_state_dict(state["density"])
         self.position = state["position"]

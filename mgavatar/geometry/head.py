@@ -66,8 +66,7 @@ class PersonalHead(nn.Module):
         self.tracked_joints: Tensor
         with torch.no_grad():
             self.register_buffer("tracked_joints", body.joints(self._tracked_shape(params)), persistent=False)
-        template = torch.tensor(body.fine.v_template, device=device)
-        self.refine = RefineNet(template, config).to(device)
+        self.refine = RefineNet(torch.tensor(body.fine.v_template), config).to(device)
 
     def learn_poses(self) -> None:
         """Let the parameters of all timesteps learn; jaw and eyes where ``learn_jaw`` and ``learn_eyes`` say so."""

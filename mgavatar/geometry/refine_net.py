@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -43,9 +45,14 @@ class RefineNet(nn.Module):
         place = ((v_template - low) / (high - low).max()).cpu()
         pairs = ((0, 1), (1, 2), (2, 0))
         self._samplers: list[SparseMatrix] = [
-            uv_sampler(place[:, list(pair)].contiguous(), resolution, resolution).to(v_template.device)
-            for pair in pairs
+            uv_sampler(place[:, list(pair)].contiguous(), resolution, resolution) for pair in pairs
         ]
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> RefineNet:
+        """Move the samplers with the parameters; torch calls this for ``to`` and ``cuda``."""
+        super()._apply(fn, recurse)
+        self._samplers = [sampler.to(self.planes.device) for sampler in self._samplers]
+        return self
 
     def networks(self) -> list[nn.Parameter]:
         """What learns besides the triplane."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import Pose
@@ -18,7 +19,7 @@ from mgavatar.kernels.mesh_geometry import corner_sum, vertex_edge_lengths, vert
 from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 
 
-class Body:
+class Body(nn.Module):
     """A subdivided head.
 
     Directions are linear, and so is subdivision: directions are evaluated on the base mesh, and their sum is then
@@ -27,7 +28,6 @@ class Body:
     Attributes:
         model: The head model as given, the base mesh.
         subdivisions: Number of midpoint subdivisions.
-        device: Device of all tensors but ``parents``.
         fine: The head model after subdivision, without its directions.
         v_template: Rest vertices of the base mesh [m], shape [V_base, 3].
         shape_dirs: Identity directions [m per unit], shape [n_shape, V_base, 3].
@@ -40,6 +40,14 @@ class Body:
         faces: Vertex indices of the fine mesh, shape [F, 3], int32.
     """
 
+    v_template: Tensor
+    shape_dirs: Tensor
+    expr_dirs: Tensor
+    pose_dirs: Tensor
+    J_regressor: Tensor
+    lbs_weights: Tensor
+    faces: Tensor
+
     def __init__(self, model: HeadModel, *, subdivisions: int, device: torch.device | str = "cpu") -> None:
         """Subdivide a head model and move it to a device.
 
@@ -48,24 +56,39 @@ class Body:
             subdivisions: Number of midpoint subdivisions; the paper's mesh is FLAME's after one.
             device: Device of all tensors.
         """
+        super().__init__()
         self.model = model
         self.subdivisions = subdivisions
-        self.device = torch.device(device)
-        self.fine, steps = _subdivided(model, subdivisions)
-        self._subdivision = [step.to(self.device) for step in steps]
-        self.v_template = self._tensor(model.v_template)
+        self.fine, self._subdivision = _subdivided(model, subdivisions)
         dirs = np.moveaxis(model.shapedirs, 2, 0)
-        self.shape_dirs = self._tensor(dirs[: model.n_shape])
-        self.expr_dirs = self._tensor(dirs[model.n_shape :])
-        self.pose_dirs = self._tensor(np.moveaxis(model.posedirs, 2, 0))
+        arrays = {
+            "v_template": model.v_template,
+            "shape_dirs": dirs[: model.n_shape],
+            "expr_dirs": dirs[model.n_shape :],
+            "pose_dirs": np.moveaxis(model.posedirs, 2, 0),
+            "J_regressor": model.J_regressor,
+            "lbs_weights": self.fine.lbs_weights,
+        }
+        for name, array in arrays.items():
+            # Not persistent: an avatar file has the head model itself.
+            self.register_buffer(name, torch.tensor(np.ascontiguousarray(array), dtype=torch.float32), persistent=False)
+        self.register_buffer("faces", torch.tensor(self.fine.faces, dtype=torch.int32), persistent=False)
         self.has_pose_dirs = bool(np.any(model.posedirs))
-        self.J_regressor = self._tensor(model.J_regressor)
-        self.parents = torch.tensor(model.parents, dtype=torch.int32)  # only the host reads it
-        self.lbs_weights = self._tensor(self.fine.lbs_weights)
-        self.faces = torch.tensor(self.fine.faces, dtype=torch.int32, device=self.device)
+        self.parents = torch.tensor(model.parents, dtype=torch.int32)  # no buffer: only the host reads it
+        self.to(device)
 
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=self.device)
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Body:
+        """Move the matrices with the tensors; torch calls this for ``to`` and ``cuda``."""
+        super()._apply(fn, recurse)
+        self._subdivision = [step.to(self.device) for step in self._subdivision]
+        for name in ("laplacian", "_corners"):
+            self.__dict__.pop(name, None)  # built again from the moved faces when needed
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Return the device of all tensors but ``parents``."""
+        return self.v_template.device
 
     @property
     def n_verts(self) -> int:
