@@ -19,11 +19,12 @@ import torch
 from PIL import Image
 from tiny import tiny_config, tiny_head, write_tiny_capture
 
-from mgavatar import cli
+from mgavatar import __version__, cli
 from mgavatar.avatar import Avatar
+from mgavatar.config import keys
 from mgavatar.geometry.stage import GeometryStage
 from mgavatar.head.load import save_head_model
-from mgavatar.presets import to_toml
+from mgavatar.presets import preset_names, to_toml
 
 CHILD_ENV = {**os.environ, "GOMP_SPINCOUNT": "0", "OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}
 
@@ -265,7 +266,7 @@ def test_help_imports_neither_torch_nor_warp():
     """So that it is quick; for the program and for its largest command."""
     code = """
         import sys
-        from mgavatar import cli
+        from mgavatar import __version__, cli
         for argv in (["--help"], ["fit", "--help"], ["fit", "--help-all"]):
             sys.argv = ["mgavatar", *argv]
             try:
@@ -368,3 +369,137 @@ def test_a_capture_with_more_coefficients_than_the_head_is_said(work, mgavatar):
     assert result.code == 0, result.err
     assert "expr has 5 columns" in result.err
     assert "takes 3" in result.err
+
+
+def test_the_two_commands_of_the_readme(work, mgavatar, monkeypatch):
+    """``fit --data`` and ``render --avatar --driving`` alone write into the working folder and say where."""
+    shutil.copy(work / "head.npz", work / "capture/head_model.npz")
+    (work / "here").mkdir()
+    monkeypatch.chdir(work / "here")
+    result = mgavatar("fit", "--data", "../capture", "--preset", "../tiny.toml")
+    assert result.code == 0, result.err
+    assert result.out.split() == ["out.pt", "out/report.html"]
+    result = mgavatar("render", "--avatar", "out.pt", "--driving", "../driving.npz")
+    assert result.code == 0, result.err
+    assert result.out.split() == ["driving.mp4"]
+    assert {path.name for path in Path.cwd().iterdir()} == {"out.pt", "out", "driving.mp4"}
+    assert Path("driving.mp4").read_bytes()[4:8] == b"ftyp"
+
+    # Nothing that is there is lost by giving the same commands again.
+    before = tree(work)
+    assert_one_line(mgavatar("fit", "--data", "../capture", "--preset", "../tiny.toml"), "out", "--out", "--resume")
+    assert_one_line(
+        mgavatar("render", "--avatar", "out.pt", "--driving", "../driving.npz"), "driving.mp4", "--overwrite"
+    )
+    assert tree(work) == before
+    result = mgavatar("render", "--avatar", "out.pt", "--driving", "../driving.npz", "--overwrite", "--frames", "0:1")
+    assert result.code == 0, result.err
+
+
+def test_a_rendering_without_pyav_is_a_gif(work, mgavatar, monkeypatch):
+    """The default name goes by what can be written; asking for a video says what to install."""
+    assert mgavatar(*fit_args(work)).code == 0
+    monkeypatch.chdir(work)
+    monkeypatch.setattr("mgavatar.driving.writers.importlib.util.find_spec", lambda name: None)
+    result = mgavatar("render", "--avatar", "run", "--driving", "driving.npz")
+    assert (result.code, result.out.strip()) == (0, "driving.gif"), result.err
+    assert_one_line(
+        mgavatar("render", "--avatar", "run", "--driving", "driving.npz", "--format", "mp4"), "pip install", "PyAV"
+    )
+
+
+def test_the_head_model_of_a_bare_fit_is_found_or_asked_for(work, mgavatar, monkeypatch):
+    """Beside the transforms, else in the environment, else one line; never the built-in head in silence."""
+    monkeypatch.delenv("MGAVATAR_HEAD_MODEL", raising=False)
+    bare = ["fit", "--data", work / "capture", "--out", work / "run", "--preset", work / "tiny.toml"]
+    assert_one_line(mgavatar(*bare), "capture", "--head-model", "MGAVATAR_HEAD_MODEL", "builtin")
+    assert not (work / "run").exists()
+    monkeypatch.setenv("MGAVATAR_HEAD_MODEL", str(work / "head.npz"))
+    result = mgavatar(*bare)
+    assert result.code == 0, result.err
+    assert Avatar.load(work / "run").head_model.n_expr == tiny_head().n_expr
+
+
+@pytest.mark.parametrize(("frames", "n"), [("0:2", 2), ("1:", 2), (":1", 1), ("0:3:2", 2), ("::2", 2), ("0:99", 3)])
+def test_frames_of_a_motion(frames, n, work, mgavatar):
+    """A slice, as in Python; beyond the end it ends."""
+    assert mgavatar(*fit_args(work)).code == 0
+    result = mgavatar("render", "--avatar", work / "run", "--driving", work / "driving.npz", "--frames", frames,
+                      "--out", work / "frames")  # fmt: skip
+    assert result.code == 0, result.err
+    assert len(list((work / "frames").glob("*.png"))) == n
+
+
+@pytest.mark.parametrize("frames", ["3", "a:b", "1:2:0", "-1:2", "1:2:3:4", "1.5:2"])
+def test_frames_that_are_none(frames, work, mgavatar):
+    """One line with an example, before anything is read."""
+    result = mgavatar("render", "--avatar", work / "absent", "--driving", work / "driving.npz", f"--frames={frames}")
+    assert_one_line(result, f"--frames {frames}", "START:STOP")
+
+
+@pytest.mark.parametrize("fps", ["0", "-5", "nan", "100000"])
+def test_frame_rates_that_are_none(fps, work, mgavatar):
+    """One line."""
+    result = mgavatar("render", "--avatar", work / "x", "--driving", work / "driving.npz", f"--fps={fps}")
+    assert_one_line(result, "--fps", "between 0 and 1000")
+
+
+def test_a_capture_on_black_can_be_said(work, mgavatar):
+    """``--background`` reaches the reader and the avatar; without it a warning names it."""
+    for path in (work / "capture/images").glob("*.png"):
+        pixels = np.asarray(Image.open(path)).copy()
+        pixels[np.asarray(Image.open(work / "capture/fg_masks" / path.name)) == 0] = 0
+        Image.fromarray(pixels).save(path)
+    result = mgavatar(*fit_args(work, "--background", "black"))
+    assert result.code == 0, result.err
+    assert "not on the stated background" not in result.err
+    assert Avatar.load(work / "run").capture.background.tolist() == [0.0, 0.0, 0.0]
+    result = mgavatar("evaluate", "--avatar", work / "run", "--data", work / "capture", "--json", work / "m.json")
+    assert "not on the stated background" not in result.err
+    shutil.rmtree(work / "run")
+    assert "--background black" in mgavatar(*fit_args(work)).err
+
+
+def test_the_version_and_the_module():
+    """``--version`` is one line; ``python -m mgavatar`` is the same program."""
+    command = [sys.executable, "-m", "mgavatar", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, env=CHILD_ENV)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"mgavatar {__version__}\n", "")
+
+
+@pytest.mark.parametrize("argv", ["fit --help-all", "fit --help", "--help", "--version"])
+def test_a_reader_who_leaves_is_no_error(argv):
+    """``mgavatar fit --help | head -1`` ends without a traceback, however much was still to be written."""
+    code = "import sys; from mgavatar.cli import main; main()"
+    command = f"{sys.executable} -c '{code}' {argv} | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=CHILD_ENV)
+    assert done.stderr == ""
+
+
+def test_help_shows_what_will_run(mgavatar):
+    """Defaults are those of the preset that is named; the paper's are shown for the paper's."""
+    for preset_name, iterations in (("quick", 700), ("paper", 100_000)):
+        said = mgavatar("fit", "--help-all", "--preset", preset_name).out
+        entry = said[said.index("--geometry.iterations") :].split("--geometry.max-image-size")[0]
+        assert f"(default: {iterations})" in " ".join(entry.replace("│", " ").split())
+
+
+def test_help_fits_a_screen_and_help_all_has_the_rest(mgavatar):
+    """What people set, with the presets, in 50 lines of plain text; every key of the configuration in the other."""
+    short, whole = mgavatar("fit", "--help").out, mgavatar("fit", "--help-all").out
+    assert len(short.splitlines()) <= 50
+    assert "--geometry" not in short
+    assert all(name in short for name in preset_names())
+    assert "--help-all" in short
+    for key, _ in keys():
+        *sections, name = key.replace("_", "-").split(".")
+        flags = (".".join([*sections, name]), ".".join([*sections, f"no-{name}"]))
+        assert any(f"--{flag}" in whole for flag in flags), key
+    for text in (
+        short,
+        whole,
+        *(mgavatar(command, "--help").out for command in ("render", "evaluate", "synth", "demo")),
+    ):
+        assert "``" not in text
+        assert ":class:" not in text
+        assert "[bold" not in text
