@@ -14,7 +14,6 @@ FOLDERS = ("mgavatar", "kernels", "tools")
 
 NOT_YET = (
     "mgavatar/appearance",
-    "mgavatar/fitting",
     "mgavatar/geometry",
 )
 """Folders and files whose docstrings are not yet as they should be."""

@@ -1,9 +1,9 @@
-"""A fit that ends when it is told to: how far through its schedule each iteration may go.
+"""A fit that ends on time: the step of each iteration through its stage's schedule.
 
-A stage's schedule (rates, density control) is counted in iterations as configured. Without a budget each iteration
-moves it by one. With one it moves by the share of what is left that an iteration takes of the time that is left, at the
-pace of the last few: the schedule ends with the time, whatever other work does to the machine and however the number of
-Gaussians grows. ``docs/presets-and-budgets.md`` explains it.
+A stage's schedule (rates, density control) is counted in iterations as configured. Without a budget, each iteration
+moves it by one. With a budget, an iteration that takes a share of the time left moves it by the same share of the
+schedule left, at the pace of the last few iterations. So the schedule ends with the time, whatever else the machine
+does and however the number of Gaussians grows. ``docs/presets-and-budgets.md`` explains it.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from collections.abc import Callable
 from mgavatar.errors import DataError
 
 GEOMETRY_SHARE = 0.22
-"""Of the time for both stages; what the ``quick`` preset takes."""
+"""Share of the geometry stage in the time of both stages, as in the ``quick`` preset."""
 
 RESERVE = 0.02
 """Share of the budget that is kept for writing the avatar."""
 
 LEAST = 20
-"""Iterations that each stage gets, whatever happens: fewer are no fit."""
+"""Least number of iterations per stage; fewer are no fit."""
 
 SHORTEST = 10.0
-"""Seconds; less does not even read a capture."""
+"""Shortest budget [s]; less does not even read a capture."""
 
 
 class TooShort(DataError):
@@ -35,15 +35,15 @@ class TooShort(DataError):
 
 
 _WARM_UP = 3  # iterations before the pace is known: the first ones load or compile kernels
-_WINDOW = 15  # iterations that the pace is the median of: a checkpoint or a hiccup among them does not matter
+_WINDOW = 15  # iterations of which the pace is the median: a checkpoint among them does not count
 _UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
 def parse_budget(text: str) -> float:
-    """Seconds of ``90s``, ``5m`` or ``1.5h``.
+    """Return the seconds of a time such as ``90s``, ``5m`` or ``1.5h``.
 
     Raises:
-        DataError: If it is none of these, or too short for any fit.
+        DataError: If the text is not such a time, or too short for any fit.
     """
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)([smh])", text.strip())
     if not found:
@@ -55,7 +55,7 @@ def parse_budget(text: str) -> float:
 
 
 def duration(seconds: float) -> str:
-    """A time as :func:`parse_budget` reads it, rounded up to what it shows: 90s, 5m, 1.5h."""
+    """Write seconds as a time that :func:`parse_budget` reads, rounded up: 90s, 5m, 1.5h."""
     if seconds < 120.0:
         return f"{math.ceil(seconds - 1e-9)}s"
     unit, name = (60.0, "m") if seconds < 7200.0 else (3600.0, "h")
@@ -63,12 +63,12 @@ def duration(seconds: float) -> str:
 
 
 class Budget:
-    """Seconds for a whole fit, counted from when this is made.
+    """The time of a whole fit; it runs as soon as the object is made.
 
     Attributes:
-        seconds: All of them.
-        spent: Of these before this process, when a fit goes on.
-        clock: Seconds that only ever grow.
+        seconds: The whole time [s].
+        spent: Time spent before this process, if the fit is resumed [s].
+        clock: Monotonic clock [s].
     """
 
     def __init__(self, seconds: float, *, spent: float = 0.0, clock: Callable[[], float] = time.monotonic) -> None:
@@ -77,29 +77,29 @@ class Budget:
 
     @property
     def used(self) -> float:
-        """Seconds used so far."""
+        """Return the time used so far [s]."""
         return self.spent + self.clock() - self.started
 
     def pacer(self, iterations: int, *, share: float, must_fit: bool) -> Pacer:
         """Return the pacer of a stage that starts now.
 
         Args:
-            iterations: Of the stage's schedule.
-            share: Of the time that is left.
-            must_fit: Refuse the budget if the stage cannot make its least iterations; otherwise make them anyway.
+            iterations: Iterations of the stage's schedule.
+            share: Share of the stage in the time that is left.
+            must_fit: Refuse the budget if it is too short for the least number of iterations; otherwise exceed it.
         """
         left = self.seconds * (1.0 - RESERVE) - self.used
         return Pacer(self, iterations, self.clock() + share * left, share if must_fit else None)
 
 
 def geometry_share(progress: float) -> float:
-    """Share of the remaining time that the geometry stage gets when it is through ``progress`` (0..1) of itself."""
+    """Return the share of the geometry stage in the time left, after ``progress`` (0..1) of the stage."""
     rest = GEOMETRY_SHARE * (1.0 - progress)
     return rest / (rest + 1.0 - GEOMETRY_SHARE)
 
 
 class Pacer:
-    """How far each iteration of one stage moves the schedule, so that both it and the time end together."""
+    """The step of each iteration of one stage, so that schedule and time end together."""
 
     def __init__(self, budget: Budget, iterations: int, deadline: float, share: float | None) -> None:
         self.budget, self.iterations, self.deadline, self.share = budget, iterations, deadline, share
@@ -109,19 +109,25 @@ class Pacer:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the last iteration was the first whose pace was known."""
+        """Return True at the first iteration with a known pace."""
         return self.n == _WARM_UP + 1
 
     @property
     def left(self) -> float:
-        """Seconds until the stage is to end."""
+        """Return the time until the stage should end [s]."""
         return self.deadline - self.budget.clock()
 
     def schedule_step(self, position: float) -> float:
-        """Call it before every iteration, at ``position``: configured iterations by which it moves the schedule.
+        """Return the step of the iteration that begins now; call it once per iteration.
+
+        Args:
+            position: Place in the schedule, in configured iterations.
+
+        Returns:
+            Step through the schedule, in configured iterations.
 
         Raises:
-            TooShort: Once the pace is known, if the budget is too small for the first stage.
+            TooShort: At the first iteration with a known pace, if the budget is too short for the first stage.
         """
         now = self.budget.clock()
         if self.last is not None:
@@ -135,6 +141,8 @@ class Pacer:
         each, left = statistics.median(self.seconds), self.deadline - now
         if self.calibrated and self.share is not None:
             self._check(each, left)
+        # left / each iterations still fit into the time; this one moves the schedule by one part in so many of what is
+        # left of it. ``most`` keeps at least LEAST iterations, even if they exceed the time.
         return most if left <= each else min(rest * each / left, most)
 
     def _check(self, each: float, left: float) -> None:

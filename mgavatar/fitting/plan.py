@@ -24,28 +24,29 @@ FINE_ENOUGH = 12_000
 """A head model with so many vertices is not subdivided; the paper's mesh has 20K."""
 
 STILL = 0.1
-"""A joint that turns by less than this [deg] was not tracked, or was held."""
+"""Turn [deg] below which a joint was not tracked, or held."""
 
 SMALL_TURN = 2.0
-"""Turns of neck, jaw and eyes up to this [deg] deform the surface by less than images show: a chin 100 mm from its
-joint moves 3.5 mm, and what skinning gets wrong of that is a tenth."""
+"""Turn of neck, jaw and eyes [deg] up to which images do not show the errors of skinning: a chin 100 mm from its joint
+moves by 3.5 mm, of which skinning gets a tenth wrong."""
 
 HALF_PIXEL, HALF_TURN = 0.5, 0.5
-"""Motion up to this [px], or a joint's up to this [deg] (0.9 mm on a chin), is not seen."""
+"""Motion [px] and turn of a joint [deg] up to which images do not show them; the turn moves a chin by 0.9 mm."""
 
 ONE_DIRECTION = 2.0
-"""Directions that differ from their mean by no more than this [deg] are one."""
+"""Angle [deg] to their mean up to which view directions count as one."""
 
 NARROW_VIEWS = 10.0
-"""Over so small an angle [deg] the shading of skin changes by 1 - cos(10 deg) = 1.5 %, four of 255 steps."""
+"""Angle [deg] up to which shading hardly varies: that of skin by 1 - cos(10 deg) = 1.5 %, four of 255 steps."""
 
 LEVELS, FINEST = 16, 4096
-"""The paper's grid: 16 levels from 16 to 4096 cells."""
+"""Number of levels and finest resolution of the paper's grid, which starts at 16 cells."""
 
 GROWTH = 256.0 ** (1.0 / 15.0)
-"""Each of its levels is 1.45 times finer than the last; here it is as much at most."""
+"""Largest ratio of the resolutions of two levels, that of the paper's grid: 1.45."""
 
 MAP_SIZES = (64, 128, 256)
+"""Sizes of OffsetNet's maps to choose from [px]."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,9 @@ class Decision:
     """One key that was ``auto``.
 
     Attributes:
-        key: As in the configuration, with dots.
-        value: What ``auto`` became.
-        reason: Why, in a few words with its numbers.
+        key: Key of the configuration, with dots.
+        value: Value in place of ``auto``.
+        reason: The reason in a few words, with its numbers.
     """
 
     key: str
@@ -68,12 +69,12 @@ class Decision:
 
 @dataclass(frozen=True, eq=False)
 class CaptureCoverage:
-    """What the training images of a capture can show of the head model.
+    """Measures of how well the training images of a capture cover the head.
 
     Attributes:
         head: The head model.
         subject: The capture.
-        max_image_size: As in the configuration of the appearance stage [px].
+        max_image_size: Longest side of the images in the appearance stage [px].
     """
 
     head: HeadModel
@@ -82,12 +83,12 @@ class CaptureCoverage:
 
     @cached_property
     def timesteps(self) -> list[int]:
-        """Rows of the parameters that have training images."""
+        """List the rows of the parameters that have training images."""
         return sorted({frame.timestep for frame in self.subject.frames["train"]})
 
     @cached_property
     def directions(self) -> np.ndarray:
-        """From the head to the camera, in the head's own frame, unit vectors, shape [N, 3]."""
+        """Return unit vectors from the head to the camera of each training image, in the head's frame, shape [N, 3]."""
         p = self.subject.params
         rows = []
         for frame, center in zip(self.subject.frames["train"], self._centers, strict=True):
@@ -98,7 +99,7 @@ class CaptureCoverage:
 
     @cached_property
     def spread(self) -> float:
-        """Largest angle between a direction and the mean one [deg]; 180 where they cancel."""
+        """Return the largest angle of a direction to their mean [deg]; 180 if they cancel."""
         mean = self.directions.mean(0)
         if np.linalg.norm(mean) < 1e-6:
             return 180.0
@@ -106,7 +107,7 @@ class CaptureCoverage:
 
     @cached_property
     def pixel(self) -> float:
-        """Width of a pixel on the head [m], the median of the training images."""
+        """Return the width of a pixel on the head [m], the median over the training images."""
         widths = []
         for frame, center in zip(self.subject.frames["train"], self._centers, strict=True):
             camera = frame.camera
@@ -117,31 +118,36 @@ class CaptureCoverage:
 
     @cached_property
     def edge(self) -> float:
-        """Mean edge of the head model [m]."""
+        """Return the mean edge length of the head model [m]."""
         verts, faces = self.head.v_template, self.head.faces
         return float(np.linalg.norm(verts[faces] - verts[np.roll(faces, -1, axis=1)], axis=2).mean())
 
     @cached_property
     def extent(self) -> float:
-        """Longest side of the box that ColorNet's grid covers: the head's and a margin of 5 % on either side [m]."""
+        """Return the longest side of ColorNet's grid [m]: the head's box with a margin of 5 % on either side."""
         return 1.1 * float(np.ptp(self.head.v_template, axis=0).max())
 
     @cached_property
     def head_pixels(self) -> float:
-        """Pixels that the head covers in an image, front and back of its surface halved [px]; the median."""
+        """Return the number of pixels of the head in an image, the median over the training images."""
         a, b, c = np.moveaxis(self.head.v_template[self.head.faces].astype(np.float64), 1, 0)
         areas = 0.5 * np.cross(b - a, c - a)
+        # Seen from one direction, a closed surface has as much area in front as behind: half of all is in sight.
         return float(np.median(0.5 * np.abs(self.directions @ areas.T).sum(1))) / self.pixel**2
 
     def turn(self, name: str) -> float:
-        """Largest rotation of a joint away from its mean over the training timesteps [deg]."""
+        """Return the largest turn of a joint away from its mean over the training timesteps [deg].
+
+        Args:
+            name: Key of its parameters, for example ``jaw_pose``.
+        """
         values = getattr(self.subject.params, name)[self.timesteps]
         away = (values - values.mean(0)).reshape(len(values), -1, 3)
         return float(np.degrees(np.linalg.norm(away, axis=2).max()))
 
     @cached_property
     def expression(self) -> float:
-        """Largest motion of a vertex by expressions, away from their mean over the training timesteps [m]."""
+        """Return the largest motion of a vertex by expressions, away from their mean over training timesteps [m]."""
         head = self.head
         values = pad_or_truncate(self.subject.params.expr[self.timesteps], head.n_expr)
         dirs = head.shapedirs[:, :, head.n_shape :].reshape(3 * len(head.v_template), head.n_expr)
@@ -150,7 +156,7 @@ class CaptureCoverage:
 
     @cached_property
     def _centers(self) -> np.ndarray:
-        """Where the middle of the head is in each training image's world [m], shape [N, 3]."""
+        """Return the middle of the head in world space for each training image [m], shape [N, 3]."""
         p, verts = self.subject.params, self.head.v_template
         root = self.head.J_regressor[0] @ verts
         out = verts.mean(0) - root

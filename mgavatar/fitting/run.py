@@ -29,8 +29,8 @@ class Run:
     """Files of one fit.
 
     Attributes:
-        folder: ``RUN``.
-        avatar: Where the avatar goes.
+        folder: Folder of everything but the avatar.
+        avatar: Path of the avatar.
     """
 
     folder: Path
@@ -38,10 +38,12 @@ class Run:
 
     @property
     def checkpoint(self) -> Path:
+        """Return the path of the checkpoint."""
         return self.folder / "checkpoint.pt"
 
     @property
     def metrics(self) -> Path:
+        """Return the path of the log of the losses."""
         return self.folder / "metrics.jsonl"
 
 

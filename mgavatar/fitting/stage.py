@@ -1,4 +1,4 @@
-"""The interface of a stage, as the loop and the checkpoint see it."""
+"""The interface between the two stages of a fit and its loop."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from mgavatar.camera import Camera
 
 
 class Stage(Protocol):
-    """What the loop needs of a stage: its schedule has ``iterations``, and it is at ``position`` of them."""
+    """A stage of a fit.
+
+    Attributes:
+        name: ``"geometry"`` or ``"appearance"``.
+        iterations: Iterations of its schedule, as configured.
+        position: Place in its schedule, in configured iterations.
+    """
 
     name: str
     iterations: int
@@ -18,8 +24,22 @@ class Stage(Protocol):
 
     def step(
         self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
-    ) -> dict[str, float]: ...
+    ) -> dict[str, float]:
+        """Take one optimizer step on one image.
 
-    def state_dict(self) -> dict[str, Any]: ...
+        Args:
+            camera: Camera of the image.
+            timestep: Row of the capture's parameters.
+            target: The image in 0..1, shape [3, H, W].
+            background: Colour behind the subject, shape [3].
+            schedule_step: Step through the schedule, in configured iterations; a budget makes it other than 1.
 
-    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+        Returns:
+            Weighted terms of the loss by their names, and the number of ``gaussians``.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that a later process needs to go on."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from the state of a stage with the same configuration."""

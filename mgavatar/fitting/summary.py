@@ -32,7 +32,14 @@ class Summary:
         self.started = clock()
 
     def stage(self, name: str, *, iterations: int, configured: int, seconds: float) -> None:
-        """Note how far a stage is; ``seconds`` of its loop since it was last noted."""
+        """Note the place of a stage.
+
+        Args:
+            name: Name of the stage.
+            iterations: Iterations so far.
+            configured: Iterations of its schedule.
+            seconds: Time of its loop since this was last called [s].
+        """
         before = self.stages.get(name, {"seconds": 0.0})["seconds"]
         self.stages[name] = {
             "iterations": iterations,
@@ -41,12 +48,12 @@ class Summary:
         }
 
     def describe(self) -> str:
-        """In words, for the user."""
+        """Return the iterations of each stage as text."""
         stages = self.stages.items()
         return ", ".join(f"{name} {stage['iterations']} of {stage['configured']} iterations" for name, stage in stages)
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint keeps."""
+        """Return the part of the summary that a checkpoint keeps."""
         peaks = [peak for peak in (self.peak_mib, peak_mib()) if peak is not None]
         return {
             "seconds": round(self.seconds + self.clock() - self.started, 3),
@@ -55,7 +62,7 @@ class Summary:
         }
 
     def write(self, path: Path, **more: Any) -> None:
-        """Write the file, with what else is to be in it. Atomic."""
+        """Write the summary as JSON, with further entries ``more``."""
         table = self.state() | more
         if torch.cuda.is_available():
             table["peak_cuda_mib"] = round(torch.cuda.max_memory_allocated() / 2**20, 1)

@@ -42,7 +42,16 @@ class Views:
         return Views(read_images(frames, size=size), masks, cameras, [frame.timestep for frame in frames])
 
     def target(self, view: int, background: Tensor, new_background: Tensor) -> Tensor:
-        """A view in 0..1, shape [3, H, W], moved from one background colour to another."""
+        """Return a training image with another background.
+
+        Args:
+            view: Number of the view.
+            background: Colour behind the subject in the images, shape [3].
+            new_background: Colour in its place, shape [3]; images without masks keep theirs.
+
+        Returns:
+            The image in 0..1, shape [3, H, W], on the device of ``background``.
+        """
         image = self.images[view].to(background.device).float() / 255.0
         if self.masks is None:
             return image
