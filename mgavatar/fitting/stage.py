@@ -42,4 +42,4 @@ class Stage(Protocol):
         """Return everything that a later process needs to go on."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from the state of a stage with the same configuration."""
+        """Resume from the state of a stage with the same configuration."""
