@@ -10,10 +10,10 @@ from mgavatar.kernels.mlp import linear_layers, mlp
 
 
 class ColorNet(nn.Module):
-    """Colour of a Gaussian from its canonical position and the direction that it is seen from."""
+    """A field of colours over canonical positions and view directions."""
 
     def __init__(self, low: Tensor, high: Tensor, config: ResolvedColorNetConfig, *, seed: int) -> None:
-        """The field covers the box from ``low`` to ``high`` [m], each shape [3]."""
+        """Make a field over the box from ``low`` to ``high`` [m], shape [3] each."""
         super().__init__()
         self.low: Tensor
         self.size: Tensor
@@ -31,14 +31,14 @@ class ColorNet(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(n_in, config.hidden), nn.ReLU(), nn.Linear(config.hidden, 3))
 
     def forward(self, canonical_means: Tensor, directions: Tensor) -> Tensor:
-        """Eq. 9: ``c' = Phi_color([H(mu_c), d])``.
+        """Compute the colours of Gaussians, ``c' = Phi_color([H(mu_c), d])`` (Eq. 9).
 
         Args:
             canonical_means: ``mu_c`` [m], shape [N, 3].
-            directions: Unit view directions, shape [N, 3]; not looked at where ``view_frame`` is ``none``.
+            directions: Unit view directions, shape [N, 3]; unused if ``view_frame`` is ``none``.
 
         Returns:
-            RGB, shape [N, 3]: the network's distance from a middle grey, not held inside 0..1.
+            RGB, shape [N, 3], not clamped to 0..1; the network's output is the distance from a middle grey.
         """
         features = self.grid((canonical_means - self.low) / self.size)
         weights, biases = linear_layers(self.mlp)

@@ -12,10 +12,10 @@ from mgavatar.kernels.binding import place_on_faces
 from mgavatar.kernels.face_frames import face_frames
 
 PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
-"""Learnable rows of every Gaussian; ``face_ids`` goes along with them."""
+"""Learnable parameters of every Gaussian, one row each; ``face_ids`` has the same rows."""
 
 SH_PARAMETERS = ("sh_constant", "sh_others")
-"""More of them, where colours are spherical harmonics."""
+"""Further ones if colours are spherical harmonics."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +34,22 @@ class FaceFrames:
 
     @staticmethod
     def of(verts: Tensor, faces: Tensor) -> FaceFrames:
-        """Frames of a mesh, differentiable in its vertices."""
+        """Compute the frames of a mesh, differentiable in its vertices.
+
+        Args:
+            verts: Vertices [m], shape [V, 3].
+            faces: Vertex indices, shape [F, 3], int32.
+        """
         return FaceFrames(*face_frames(verts, faces))
 
     @property
     def all(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Frames of all faces, as the kernels take them."""
+        """Return rotations, sizes and centroids, the arguments of the kernels."""
         return self.quats, self.scales, self.centers
 
 
 class FaceGaussians(nn.Module):
-    """One Gaussian a face at first, at its centre; density control adds and removes others."""
+    """Gaussians bound to faces: at first one per face, at its centre; density control adds and removes others."""
 
     def __init__(self, n_faces: int, config: ResolvedAppearanceConfig, device: torch.device) -> None:
         super().__init__()
@@ -73,12 +78,19 @@ class FaceGaussians(nn.Module):
         return len(self.face_ids)
 
     def canonical_means(self, frames: FaceFrames) -> Tensor:
-        """``mu_c`` of Eq. 9: centres on the canonical mesh [m], shape [N, 3]. No gradient: the encoding stays put."""
+        """Place the centres on the canonical mesh, ``mu_c`` of Eq. 9, without a gradient.
+
+        Args:
+            frames: Frames of the canonical mesh.
+
+        Returns:
+            Centres [m], shape [N, 3].
+        """
         with torch.no_grad():
             return place_on_faces(frames.all, self.face_ids, self.local_means)
 
     def resize(self, n: int) -> None:
-        """Make room for ``n`` Gaussians, before a state of that many is loaded."""
+        """Make room for ``n`` Gaussians, whose state is then loaded."""
         for name in self.parameter_names:
             old = getattr(self, name)
             setattr(self, name, nn.Parameter(old.new_zeros(n, *old.shape[1:])))
@@ -89,22 +101,26 @@ class FaceGaussians(nn.Module):
 def face_uvs(
     local_means: Tensor, face_ids: Tensor, frames: FaceFrames, verts: Tensor, faces: Tensor, face_vt: Tensor
 ) -> Tensor:
-    """Texture coordinate under each Gaussian: its centre dropped onto its face along the normal, kept inside it.
+    """Return the texture coordinates below the Gaussians' centres, projected onto their faces along the normal.
+
+    A projection that falls outside of its face is moved into it.
 
     Args:
-        local_means: In units of k, shape [N, 3].
-        face_ids: Shape [N].
+        local_means: Centres in units of their face's scale k, shape [N, 3].
+        face_ids: Face of each Gaussian, shape [N].
         frames: Frames of the canonical mesh.
         verts: Canonical vertices [m], shape [V, 3].
-        faces: Shape [F, 3].
+        faces: Vertex indices, shape [F, 3].
         face_vt: Texture coordinates of the faces' corners, shape [F, 3, 2].
 
     Returns:
-        Shape [N, 2].
+        Texture coordinates, shape [N, 2].
     """
     with torch.no_grad():
         points = place_on_faces(frames.all, face_ids, local_means)
         a, b, c = verts[faces.long()[face_ids]].unbind(1)
+        # Barycentric weights v and w of the projection: d - v e1 - w e2 is normal to both edges. These are two linear
+        # equations, solved by Cramer's rule. The determinant is four times the squared area.
         e1, e2, d = b - a, c - a, points - a
         d11, d12, d22 = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
         p1, p2 = (d * e1).sum(1), (d * e2).sum(1)

@@ -105,7 +105,7 @@ class FrozenHead:
 
     @torch.no_grad()
     def at_timestep(self, timestep: int) -> PosedMesh:
-        """The head at a timestep of its capture; the most recently used ones are kept. No gradient."""
+        """Return the head at a timestep of its capture, without a gradient; the most recently used ones are cached."""
         if timestep not in self._posed:
             if len(self._posed) >= _CACHED_POSES:
                 self._posed.popitem(last=False)
@@ -185,10 +185,15 @@ class Appearance(nn.Module):
         return directions_on_faces(means, position, self.gaussians.face_ids, *quats)
 
     def forward(self, posed: PosedMesh, camera: Camera) -> tuple[Gaussians, Tensor | None]:
-        """Gaussians of one view.
+        """Compute the Gaussians of one view.
+
+        Args:
+            posed: The head in the view's pose.
+            camera: Camera of the view, on which colours depend.
 
         Returns:
-            The Gaussians ``G_r`` of Section 3.2, and ``O_map`` [13, H, W] for its regulariser, or None without it.
+            The Gaussians ``G_r`` of Section 3.2, and ``O_map``, shape [13, H, W], for its regulariser, or None without
+            OffsetNet.
         """
         g = self.gaussians
         offsets = self._offsets(posed)

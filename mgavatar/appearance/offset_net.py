@@ -17,10 +17,10 @@ def _conv(n_in: int, n_out: int, stride: int = 1) -> nn.Sequential:
 
 
 class OffsetNet(nn.Module):
-    """Encoder-decoder over the UV atlas; the pose enters between them.
+    """Encoder and decoder over the UV atlas, with the pose between them.
 
-    The encoder is one layer that embeds the maps and an 8-layer extractor that goes down to an eighth; the decoder has
-    5 layers, and its last one also sees the embedded maps at full resolution. It starts at zero offsets.
+    One layer embeds the maps, and eight extract features at an eighth of the resolution. The decoder has five layers,
+    the last of which also takes the embedded maps at full resolution. All offsets start at zero.
     """
 
     def __init__(self, config: ResolvedOffsetNetConfig) -> None:
@@ -43,12 +43,12 @@ class OffsetNet(nn.Module):
         nn.init.zeros_(self.last.bias)
 
     def forward(self, canonical_map: Tensor, pose_map: Tensor, theta: Tensor) -> Tensor:
-        """Eq. 10: ``O_map = Phi_d([Phi_e([M_cano, M_pose, Z]), E(theta)])``.
+        """Compute the offset maps, ``O_map = Phi_d([Phi_e([M_cano, M_pose, Z]), E(theta)])`` (Eq. 10).
 
         Args:
-            canonical_map: Canonical positions over the atlas, normalised to the head's size, shape [3, H, W].
-            pose_map: Posed positions without root motion, likewise.
-            theta: Rotation vectors [rad], shape [15].
+            canonical_map: Canonical positions over the atlas, in units of the head's size, shape [3, H, W].
+            pose_map: Posed positions without root motion, in the same units, shape [3, H, W].
+            theta: Rotation vectors of the five joints [rad], shape [15].
 
         Returns:
             Offset maps, shape [13, H, W].
@@ -61,5 +61,5 @@ class OffsetNet(nn.Module):
 
 
 def _laid_out(maps: Tensor) -> Tensor:
-    """Channels last on a CPU, where the layers are then 1.4 times faster and the samples need no transpose."""
+    """Lay maps out channels last on a CPU: layers are 1.4 times faster, and sampling needs no transpose."""
     return maps if maps.is_cuda else maps.contiguous(memory_format=torch.channels_last)

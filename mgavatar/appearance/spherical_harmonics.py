@@ -1,4 +1,4 @@
-"""Real spherical harmonics up to degree 3: the usual colours of Gaussians, in whose place ColorNet stands."""
+"""Real spherical harmonics up to degree 3, the usual colours of Gaussians, which ColorNet replaces."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _Y30 = math.sqrt(7.0 / (16.0 * math.pi))
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Y_lm of unit directions, in the order and with the signs of Gaussian splatting's files.
+    """Evaluate Y_lm, in the order and with the signs of 3D Gaussian splatting's files.
 
     Args:
-        directions: Shape [N, 3].
-        degree: 0 to 3.
+        directions: Unit directions, shape [N, 3].
+        degree: Largest degree, 0 to 3.
 
     Returns:
-        Shape [N, (degree + 1)^2].
+        Values, shape [N, (degree + 1)^2].
     """
     x, y, z = directions.unbind(1)
     values = [torch.full_like(x, _Y0)]
@@ -55,11 +55,11 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_colors(constant: Tensor, others: Tensor, directions: Tensor) -> Tensor:
-    """Colours ``0.5 + sum c_lm Y_lm(d)``, clamped at 0 as Gaussian splatting does.
+    """Compute the colours ``0.5 + sum c_lm Y_lm(d)``, clamped at 0 as in 3D Gaussian splatting.
 
     Args:
         constant: Coefficients of Y_00, shape [N, 3].
-        others: Of degrees 1 to 3, shape [N, K, 3]; K is 0, 3, 8 or 15.
+        others: Coefficients of degrees 1 to 3, shape [N, K, 3]; K is 0, 3, 8 or 15.
         directions: Unit view directions, shape [N, 3].
 
     Returns:

@@ -19,21 +19,27 @@ from mgavatar.losses import image_loss
 def binding_loss(
     local_means: Tensor, local_scales: Tensor, visible: Tensor, config: ResolvedAppearanceConfig
 ) -> Tensor:
-    """The two hinges of Eq. 11: Gaussians stay near their face and of its size, with free room below epsilon.
+    """Compute both hinges of Eq. 11, which keep Gaussians near their face and about as large as it.
 
-    Both are norms over a Gaussian's three axes in units of k, averaged over the Gaussians that the view touches.
+    Both are norms over the three axes of a Gaussian, averaged over the visible Gaussians; up to epsilon they are zero.
+
+    Args:
+        local_means: Centres in units of their face's scale k, shape [N, 3].
+        local_scales: Scales in the same units, shape [N, 3].
+        visible: True for the Gaussians in the view, shape [N].
+        config: Weights and epsilons.
     """
     seen = visible.float()
     n = seen.sum().clamp(min=1.0)
     away = torch.relu(local_means.norm(dim=1) - config.epsilon_position)
     large = torch.relu(local_scales - config.epsilon_scale).square().sum(1)
-    # sqrt has no slope at 0, where most Gaussians are; the small constant gives it one without moving the minimum.
+    # The derivative of sqrt is infinite at 0, where most Gaussians are. A small constant bounds it; the minimum stays.
     too_large = torch.sqrt(large + 1e-12) - 1e-6
     return (config.lambda_position * (away * seen).sum() + config.lambda_scale * (too_large * seen).sum()) / n
 
 
 class AppearanceStage:
-    """One optimizer step at a time."""
+    """The stage that fits colours, Gaussians and OffsetNet, one optimizer step at a time."""
 
     name = "appearance"
 
@@ -77,10 +83,7 @@ class AppearanceStage:
     def step(
         self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
     ) -> dict[str, float]:
-        """Eq. 11 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
-
-        The schedule moves on by ``schedule_step`` configured iterations; a budget makes it shorter or longer than 1.
-        """
+        """Take one optimizer step on Eq. 11, as in :meth:`mgavatar.fitting.stage.Stage.step`."""
         a, appearance = self.config.appearance, self.appearance
         gaussians, maps = appearance(self._posed(timestep), camera)
         screen_grads = torch.zeros(len(gaussians.means), 2, device=target.device)
@@ -118,7 +121,7 @@ class AppearanceStage:
             self.appearance.rebind()
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything a later process needs to go on."""
+        """Return everything that a later process needs to go on."""
         return {
             "n": len(self.appearance.gaussians),
             "appearance": self.appearance.state_dict(),
@@ -129,6 +132,7 @@ class AppearanceStage:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from the state of a stage with the same configuration, of any number of Gaussians."""
         if state["n"] != len(self.appearance.gaussians):
             self._resize(state["n"])
         self.appearance.load_state_dict(state["appearance"])

@@ -16,7 +16,7 @@ from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
 
 @dataclass(frozen=True, eq=False)
 class PosedHead:
-    """What one pose makes of the personal head; all shapes [V, 3], metres.
+    """The personal head in one pose; all shapes [V, 3], metres.
 
     Attributes:
         shaped: ``mu_bar``, the parametric identity.
@@ -32,7 +32,7 @@ class PosedHead:
 
 
 class PersonalHead(nn.Module):
-    """Learnable identity beta, offset networks, and theta, psi and translation of every timestep."""
+    """Learnable identity beta, offset networks, and pose, expression and translation of every timestep."""
 
     def __init__(self, body: Body, params: HeadParams, config: ResolvedGeometryConfig) -> None:
         super().__init__()
@@ -69,13 +69,13 @@ class PersonalHead(nn.Module):
         self.refine = RefineNet(torch.tensor(body.fine.v_template), config).to(device)
 
     def learn_poses(self) -> None:
-        """Let the parameters of all timesteps learn; jaw and eyes where ``learn_jaw`` and ``learn_eyes`` say so."""
+        """Let the parameters of all timesteps learn; jaw and eyes only if ``learn_jaw`` and ``learn_eyes`` are set."""
         self.poses.requires_grad_(True)
         self.poses["jaw_pose"].requires_grad_(self.config.learn_jaw)
         self.poses["eyes_pose"].requires_grad_(self.config.learn_eyes)
 
     def pose(self, timestep: int) -> Pose:
-        """Parameters of a timestep of the capture, as refined so far."""
+        """Return the refined parameters of a timestep of the capture."""
         return Pose(
             *(
                 self.poses[name][timestep]
@@ -84,12 +84,12 @@ class PersonalHead(nn.Module):
         )
 
     def shaped(self) -> Tensor:
-        """``mu_bar``, the parametric identity [m], with the tracker's offsets if the configuration takes them."""
+        """Return the parametric identity ``mu_bar`` [m], shape [V, 3], with the tracker's offsets if they are used."""
         shaped = self.body.shaped(self.betas)
         return shaped + self.body.carry(self.tracked_offsets) if len(self.tracked_offsets) else shaped
 
     def posed(self, pose: Pose) -> PosedHead:
-        """Eq. 1 to 3, then expression, pose and skinning."""
+        """Compute Eq. 1 to 3: offsets, then expression, pose and skinning."""
         features = self.refine.encode()
         shaped = self.shaped()
         identity = self.refine.identity_offsets(features)
@@ -99,23 +99,23 @@ class PersonalHead(nn.Module):
         return PosedHead(shaped, identity, by_pose, self.body.posed(canonical + by_pose, pose, joints=joints))
 
     def _tracked_shape(self, params: HeadParams) -> Tensor:
-        """The tracker's own neutral head [m], with its offsets where it has some."""
+        """Return the tracker's own neutral head [m], shape [V, 3], with its offsets if it has some."""
         betas = torch.from_numpy(pad_or_truncate(params.shape, self.body.model.n_shape)).to(self.body.device)
         offsets = _base_offsets(params.static_offset, len(self.body.v_template))
         shaped = self.body.shaped(betas)
         return shaped if offsets is None else shaped + self.body.carry(torch.from_numpy(offsets).to(shaped))
 
     def joints(self, canonical: Tensor) -> Tensor:
-        """Rest joints [m], shape [5, 3], as ``config.joints`` says."""
+        """Return the rest joints [m], shape [5, 3]: of the refined head, or of the tracked one (``config.joints``)."""
         return self.body.joints(canonical) if self.config.joints == "refined" else self.tracked_joints
 
     def canonical(self) -> Tensor:
-        """``mu_c`` of Eq. 1: the neutral personal head [m], shape [V, 3]."""
+        """Return the neutral personal head ``mu_c`` of Eq. 1 [m], shape [V, 3]."""
         return self.shaped() + self.refine.identity_offsets(self.refine.encode())
 
 
 def _base_offsets(static_offset: np.ndarray | None, n_verts: int) -> np.ndarray | None:
-    """The tracker's offsets [m] for each vertex of the head model, shape [n_verts, 3]; zero where it has none."""
+    """Return the tracker's offset of each vertex of the head model [m], shape [n_verts, 3]; zero where it has none."""
     if static_offset is None:
         return None
     offsets = np.zeros((n_verts, 3), np.float32)

@@ -13,11 +13,11 @@ from mgavatar.kernels.sparse import SparseMatrix, sparse_apply
 from mgavatar.kernels.uv_map import uv_sampler
 
 N_POSE = 12
-"""Neck, jaw and both eyes: the rotations that Phi_pose sees."""
+"""Number of inputs of Phi_pose for the rotations of neck, jaw and both eyes."""
 
 
 def _mlp(n_in: int, hidden: int) -> nn.Sequential:
-    """Four layers to a 3-vector; the last starts at zero, so training starts at the template."""
+    """Return four layers to a 3-vector; the last one starts at zero, and so training at the template."""
     last = nn.Linear(hidden, 3)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -55,22 +55,27 @@ class RefineNet(nn.Module):
         return self
 
     def networks(self) -> list[nn.Parameter]:
-        """What learns besides the triplane."""
+        """List the parameters of the networks, all but the triplane."""
         return [parameter for name, parameter in self.named_parameters() if name != "planes"]
 
     def encode(self) -> Tensor:
-        """Triplane features of all vertices, ``E_tri(mu_0)``, shape [V, 3 channels]."""
+        """Return the triplane features of all vertices, ``E_tri(mu_0)``, shape [V, 3 channels]."""
         return torch.cat([sparse_apply(s, plane) for s, plane in zip(self._samplers, self.planes, strict=True)], 1)
 
     def identity_offsets(self, features: Tensor) -> Tensor:
-        """Eq. 1: ``delta mu_id`` [m], shape [V, 3]; zero if switched off."""
+        """Compute the identity offsets ``delta mu_id`` of Eq. 1 [m], shape [V, 3]; zero if switched off."""
         if self.phi_id is None:
             return torch.zeros(len(features), 3, device=features.device)
         weights, biases = linear_layers(self.phi_id)
         return self.unit * mlp(features, weights, biases)
 
     def pose_offsets(self, features: Tensor, pose: Tensor) -> Tensor:
-        """Eq. 2: ``delta mu_pose`` [m] from neck, jaw and eye rotations [12], shape [V, 3]; zero if switched off."""
+        """Compute the pose offsets ``delta mu_pose`` of Eq. 2 [m], shape [V, 3]; zero if switched off.
+
+        Args:
+            features: Triplane features, shape [V, 3 channels].
+            pose: Rotation vectors of neck, jaw and both eyes [rad], shape [12].
+        """
         if self.phi_pose is None:
             return torch.zeros(len(features), 3, device=features.device)
         weights, biases = linear_layers(self.phi_pose)

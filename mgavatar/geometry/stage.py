@@ -16,20 +16,21 @@ from mgavatar.losses import image_loss
 
 
 def offset_loss(posed: PosedHead, scales: Tensor) -> Tensor:
-    """Eq. 5; squared lengths [m^2] averaged over vertices."""
+    """Compute Eq. 5: squared lengths of the offsets, and squared scales, averaged over vertices [m^2]."""
     identity, by_pose = posed.identity_offsets, posed.pose_offsets
     return identity.square().sum(1).mean() + by_pose.square().sum(1).mean() + scales.square().mean()
 
 
 def laplacian_loss(gaussians: VertexGaussians, posed: PosedHead, scales: Tensor) -> Tensor:
-    """Eq. 6; the Laplacian is linear, so differences to the parametric mesh are Laplacians of the offsets."""
+    """Compute Eq. 6, averaged over vertices [m^2]."""
+    # The Laplacian is linear: its difference between refined and parametric mesh is the Laplacian of the offsets.
     matrix = gaussians.head.body.laplacian
     offsets = torch.cat([posed.identity_offsets, posed.identity_offsets + posed.pose_offsets, scales[:, None]], 1)
     return laplacian(matrix, offsets).square().sum(1).mean()
 
 
 class GeometryStage:
-    """One optimizer step at a time."""
+    """The stage that fits the mesh with vertex-bound Gaussians, one optimizer step at a time."""
 
     name = "geometry"
 
@@ -57,10 +58,7 @@ class GeometryStage:
     def step(
         self, camera: Camera, timestep: int, target: Tensor, background: Tensor, schedule_step: float = 1.0
     ) -> dict[str, float]:
-        """Eq. 7 for one image: target [3, H, W] in 0..1. Returns the terms of the loss.
-
-        The schedule moves on by ``schedule_step`` configured iterations; a budget makes it shorter or longer than 1.
-        """
+        """Take one optimizer step on Eq. 7, as in :meth:`mgavatar.fitting.stage.Stage.step`."""
         g = self.config.geometry
         head = self.gaussians.head
         posed = head.posed(head.pose(timestep))
@@ -76,13 +74,13 @@ class GeometryStage:
         for group in self.optimizer.param_groups:
             group["lr"] *= self.decay**schedule_step
         self.position += schedule_step
-        if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn, so no other term would tell
+        if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn: no other term shows it
             loss = loss * torch.nan
         terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()
         return dict(zip(("loss", "image", "offset", "laplacian"), terms, strict=True)) | {"gaussians": len(scales)}
 
     def image_weights(self) -> ImageLossConfig:
-        """Weights of Eq. 4 at this point of the stage: from those of ``loss`` to those of ``geometry.ssim``."""
+        """Return the weights of Eq. 4 now: they go linearly from those of ``loss`` to those of ``geometry.ssim``."""
         start, end = self.config.loss, self.config.geometry.ssim
         if end is None:
             return start
@@ -92,7 +90,7 @@ class GeometryStage:
         )
 
     def state_dict(self) -> dict[str, object]:
-        """Everything a later process needs to go on."""
+        """Return everything that a later process needs to go on."""
         return {
             "gaussians": self.gaussians.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -100,6 +98,7 @@ class GeometryStage:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from the state of a stage with the same configuration."""
         self.gaussians.load_state_dict(state["gaussians"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.position = state["position"]

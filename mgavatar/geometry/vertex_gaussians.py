@@ -14,7 +14,7 @@ from mgavatar.kernels.rasterize import RasterSettings, Rendering
 
 
 class VertexGaussians(nn.Module):
-    """One Gaussian a vertex with reduced freedom: no rotation, one scale, opacity 1, SH degree 0 colour."""
+    """One Gaussian per vertex with few parameters: no rotation, one scale, opacity 1, one colour for all directions."""
 
     def __init__(self, head: PersonalHead, config: ResolvedConfig) -> None:
         super().__init__()
@@ -29,7 +29,10 @@ class VertexGaussians(nn.Module):
         self.register_buffer("start_edges", edges, persistent=False)
 
     def scales(self, posed: PosedHead) -> Tensor:
-        """Sigma of every Gaussian [m], shape [V]."""
+        """Return the standard deviation of every Gaussian [m], shape [V].
+
+        With ``scales_follow_mesh``, it changes with the edges at its vertex as identity offsets stretch them.
+        """
         scales = self.log_scales.exp()
         if not self.config.geometry.scales_follow_mesh:
             return scales
@@ -37,21 +40,20 @@ class VertexGaussians(nn.Module):
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
     def bound(self, posed: PosedHead, camera: Camera, *, scales: Tensor | None = None) -> Gaussians:
-        """The Gaussians on a posed head as a camera sees them: drawn behind the surface by :func:`silhouette_offset`.
+        """Return the Gaussians on a posed head for a camera, behind the surface by :func:`silhouette_offset`.
 
-        ``scales`` are those of :meth:`scales`, for a caller that has them already.
+        Args:
+            posed: The posed head.
+            camera: The camera.
+            scales: The result of :meth:`scales` if it is at hand.
         """
         verts = posed.verts
         scales = self.scales(posed) if scales is None else scales
         shift = self.config.geometry.surface_shift
         if shift:
             normals = self.head.body.normals(verts)
-            verts = (
-                verts
-                - shift
-                * silhouette_offset(scales.detach(), verts.detach(), normals.detach(), camera)[:, None]
-                * normals
-            )
+            depth = shift * silhouette_offset(scales.detach(), verts.detach(), normals.detach(), camera)
+            verts = verts - depth[:, None] * normals
         n = len(verts)
         quats = torch.zeros(n, 4, device=verts.device)
         quats[:, 0] = 1.0
@@ -61,16 +63,26 @@ class VertexGaussians(nn.Module):
     def render(
         self, posed: PosedHead, camera: Camera, background: Tensor, *, scales: Tensor | None = None
     ) -> Rendering:
+        """Draw the Gaussians of a posed head; arguments as in :meth:`bound`, ``background`` of shape [3]."""
         gaussians = self.bound(posed, camera, scales=scales)
         return draw(gaussians, camera, background=background, config=self.config.raster)
 
 
 def silhouette_offset(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Camera) -> Tensor:
-    """How far behind the surface one unit of ``surface_shift`` draws Gaussians [m], shape [N].
+    """Return the depth below the surface at which one unit of ``surface_shift`` draws Gaussians.
 
-    One sigma as the camera sees it at that distance, with the low pass of the rasterizer: what makes the outline of
-    small Gaussians is as much the pixels as themselves. Times the sine of the angle between line of sight and normal:
-    at the outline opaque Gaussians look larger than the surface that carries them, seen from the front they do not.
+    At an outline, opaque Gaussians look larger than their surface by about one sigma, seen from the front they do not:
+    the depth is sigma times the sine of the angle between line of sight and normal. The sigma includes the low pass of
+    the rasterizer at that distance, because the pixels widen the outline of small Gaussians as well.
+
+    Args:
+        sigmas: Standard deviations [m], shape [N].
+        means: Centres in world space [m], shape [N, 3].
+        normals: Unit normals of the surface, shape [N, 3].
+        camera: The camera.
+
+    Returns:
+        Depths [m], shape [N].
     """
     row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
     pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
