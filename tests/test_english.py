@@ -1,4 +1,4 @@
-"""Docstrings: every public function has one, and it begins with a verb in the imperative."""
+"""Docstrings: every public function has one, it begins with a verb, and none begins with a question."""
 
 from __future__ import annotations
 
@@ -48,6 +48,9 @@ VERBS = frozenset(
 )
 """Verbs with which a docstring may begin; add to them."""
 
+QUESTIONS = frozenset({"What", "Whether", "How", "Where", "Of"})
+ARTICLES = frozenset({"A", "An", "The"})
+
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
@@ -80,9 +83,22 @@ def faults(source: str) -> list[str]:
     return found
 
 
+def riddles(source: str) -> list[str]:
+    """List the docstrings, private ones too, that begin with a question word; those of functions, with an article."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, Function | ast.ClassDef | ast.Module) and (docstring := ast.get_docstring(node)):
+            refused = QUESTIONS | ARTICLES if isinstance(node, Function) else QUESTIONS
+            if (word := docstring.split()[0]) in refused:
+                found.append(f"{getattr(node, 'name', 'the module')} begins with {word!r}")
+    return found
+
+
 @pytest.mark.parametrize("path", sources())
 def test_docstrings_begin_with_a_verb(path: str) -> None:
-    assert not faults((ROOT / path).read_text(encoding="utf-8")), path
+    source = (ROOT / path).read_text(encoding="utf-8")
+    assert not faults(source), path
+    assert not riddles(source), path
 
 
 @pytest.mark.parametrize("begin", ["What", "Whether", "How", "Where", "Of", "A", "An", "The", "Returns", "Largest"])
@@ -95,3 +111,10 @@ def test_a_missing_docstring_is_found() -> None:
     source = "def draw() -> None:\n    def inner() -> None: ...\n\ndef _hidden() -> None: ...\n"
     assert faults(source) == ["1: draw has no docstring"]
     assert not faults('async def draw() -> None:\n    """Draw."""\n')
+
+
+def test_riddles_are_found_in_private_and_in_other_docstrings() -> None:
+    source = (
+        '"""What it does."""\n\nclass _Thing:\n    """The thing."""\n\n    def _size(self):\n        """The size."""\n'
+    )
+    assert riddles(source) == ["the module begins with 'What'", "_size begins with 'The'"]

@@ -98,7 +98,7 @@ def test_equal_depths_keep_the_order_of_the_input(device, form):
 
 
 def test_tiles_and_rows_give_the_same_result(device):
-    """16 x 16 tiles, one thread a pixel, on any device, against the CPU's 128 x 16 tiles, eight pixels at a time."""
+    """16 x 16 tiles, one thread per pixel, on any device, against the CPU's 128 x 16 tiles, eight pixels at a time."""
     assert (compositing.TILE, compositing.TILE) != (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT)
     scene = dense(torch.device("cpu"))
     cotangent = cotangent_for(scene) * decided(scene)

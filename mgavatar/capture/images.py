@@ -178,7 +178,7 @@ def _read_image(frame: Frame) -> np.ndarray:
 
 
 def _read_mask(frame: Frame) -> np.ndarray:
-    """A frame's foreground alpha, shape [H, W, 1], uint8."""
+    """Decode a frame's foreground alpha, shape [H, W, 1], uint8."""
     if frame.mask_path is None:
         raise DataError(f"{frame.image_path}: this frame has no foreground mask (fg_mask_path)")
     return _decode(frame.mask_path, frame)[..., :1]

@@ -1,4 +1,4 @@
-"""Motion that drives an avatar: FLAME parameters of T frames, from one file or a folder with a file a frame."""
+"""Motion that drives an avatar: FLAME parameters of T frames, from one file or from a folder with one per frame."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def read_driving(path: Path | str) -> Driving:
     folder = path / "flame_param" if (path / "flame_param").is_dir() else path
     files = sorted(folder.glob("*.npz"), key=_frame_order)
     if not files:
-        raise DataError(f"{path}: no .npz files in this folder; one file, or one a frame as in VHAP's flame_param/")
+        raise DataError(f"{path}: no .npz files in this folder; one file, or one per frame as in VHAP's flame_param/")
     return _concatenated([_read_file(file) for file in files], path=path)
 
 
@@ -98,7 +98,7 @@ def _read_file(path: Path) -> Driving:
 
 
 def _rows(value: np.ndarray, key: str, *, path: Path) -> np.ndarray:
-    """A parameter of all frames, [T, n] float32, from that shape, (n,), (T, 1, n) or (1, T, n)."""
+    """Return a parameter of all frames as float32 [T, n], from that shape, (n,), (T, 1, n) or (1, T, n)."""
     rows = float_array(value, where=f"{path}: {key}")
     if rows.ndim == 3 and 1 in rows.shape[:2]:
         rows = rows.squeeze(1 if rows.shape[1] == 1 else 0)

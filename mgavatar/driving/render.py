@@ -69,7 +69,7 @@ def render(
 
 
 def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:
-    """A line if the driven head leaves the picture."""
+    """Return a line if the driven head leaves the picture."""
     names = ("rotation", "neck_pose", "translation")
     places = head_points(avatar, *(np.stack([getattr(pose, name).numpy() for pose in poses]) for name in names))
     outside = sum(not _sees(camera, place) for camera, place in zip(cameras, places, strict=True))

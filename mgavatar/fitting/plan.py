@@ -281,7 +281,7 @@ RULES: dict[str, Callable[[FitConfig, CaptureCoverage], tuple[Any, str]]] = {
 
 
 def _matters(config: FitConfig, key: str) -> bool:
-    """Whether the part that a key belongs to takes part in the fit."""
+    """Return True if the key's component is enabled."""
     if key.startswith("geometry.learn"):
         return config.geometry.enabled or config.appearance.head_tuning.enabled
     if key == "geometry.pose_offsets":
@@ -302,7 +302,7 @@ def _value(config: Any, key: str) -> Any:
 
 
 def _with(config: Any, key: str, value: Any) -> Any:
-    """A copy of nested dataclasses with another value at a dotted key."""
+    """Return a copy of nested dataclasses with another value at a dotted key."""
     name, _, rest = key.partition(".")
     return dataclasses.replace(config, **{name: _with(getattr(config, name), rest, value) if rest else value})
 

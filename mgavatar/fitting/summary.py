@@ -1,4 +1,4 @@
-"""What a fit took, as ``summary.json``: time and iterations of its stages, memory, size."""
+"""The summary of a fit, ``summary.json``: time and iterations of its stages, memory, size."""
 
 from __future__ import annotations
 

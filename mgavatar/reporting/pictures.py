@@ -135,7 +135,7 @@ def _held_out_poses(avatar: Avatar, subject: Subject) -> list[Pose]:
 
 
 def _of_height(camera: Camera, height: int) -> Camera:
-    """The same view, no higher than ``height`` [px]."""
+    """Return the same view, no higher than ``height`` [px]."""
     if camera.height <= height:
         return camera
     return camera.scaled(max(1, round(camera.width * height / camera.height)), height)

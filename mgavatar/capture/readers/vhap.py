@@ -132,7 +132,7 @@ def _check_duplicates(entries: dict[Split, list[_Entry]], root: Path) -> None:
 
 
 def _params_of_timesteps(entries: dict[Split, list[_Entry]], root: Path) -> dict[int, Path]:
-    """The one parameter file of each timestep."""
+    """Return the parameter file of each timestep, of which there is one."""
     params_of: dict[int, Path] = {}
     for entry in (entry for split in SPLITS for entry in entries[split]):
         path = params_of.setdefault(entry.timestep_id, entry.params_path)
