@@ -183,12 +183,13 @@ def frontal_arc(cameras: int, size: tuple[int, int]) -> list[Camera]:
         cameras: Number of cameras.
         size: Image width and height [px].
     """
-    upper = -(-cameras // 2)
-    places = [(yaw, -13.0) for yaw in np.linspace(-60, 60, upper)]
-    places += [(yaw, 9.0) for yaw in np.linspace(-52, 52, cameras - upper)] if cameras - upper > 1 else []
-    places += [(6.0, 9.0)] if cameras - upper == 1 else []
+    n_lower = cameras // 2
+    n_upper = cameras - n_lower
+    lower_yaws = np.linspace(-52, 52, n_lower) if n_lower != 1 else [6.0]
+    places = [(yaw, -13.0) for yaw in np.linspace(-60, 60, n_upper)] + [(yaw, 9.0) for yaw in lower_yaws]
+    # The held-out number and that of the lower camera nearest to the front change places; 1e-6 prefers the left of two.
     held_out = held_out_camera(cameras)
-    front = min(range(upper, cameras), key=lambda i: abs(places[i][0] - 1e-6), default=0)
+    front = min(range(n_upper, cameras), key=lambda i: abs(places[i][0] - 1e-6), default=0)
     places[held_out], places[front] = places[front], places[held_out]
     return [_camera(yaw, pitch, size) for yaw, pitch in places]
 
