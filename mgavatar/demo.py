@@ -101,9 +101,12 @@ def demo_motion(avatar: Avatar) -> dict[str, np.ndarray]:
         for side in (f"{name}_L", f"{name}_R"):
             expr[:, names.index(side)] = values
 
-    move("smile", 0.6 * np.clip(np.sin(t), 0.0, 1.0))
-    move("brow_outer_up", 0.7 * np.clip(-np.sin(t), 0.0, 1.0))
-    move("blink", np.clip(6.0 * np.cos(2.0 * t + 0.6) - 5.0, 0.0, 1.0))
+    first_half, second_half = np.clip(np.sin(t), 0.0, 1.0), np.clip(-np.sin(t), 0.0, 1.0)
+    move("smile", first_half)
+    move("cheek_raise", 0.5 * first_half)
+    move("brow_outer_up", 0.4 * second_half)
+    move("squint", np.full_like(t, 0.35))
+    move("blink", np.clip(24.0 * np.cos(t + 0.4) - 23.0, 0.0, 1.0))
     zero = np.zeros_like(t)
     speech = 0.06 * (1.0 - np.cos(5.0 * t)) * (0.6 + 0.4 * np.cos(t))
     turn = np.stack([0.10 * np.sin(2.0 * t), 0.30 * np.sin(t), 0.06 * np.sin(t + 1.0)], 1)

@@ -1,7 +1,8 @@
-"""The documentation holds together: links and commands work, code names pages that exist, prose has 100 columns."""
+"""The documentation holds together: links, commands, flags and quoted messages are those of the program today."""
 
 from __future__ import annotations
 
+import ast
 import functools
 import re
 import shlex
@@ -76,21 +77,64 @@ def prose(page: Path) -> Iterator[tuple[int, str]]:
             yield number, line
 
 
-@pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if page.parent != ROOT and page.name != "formats.md"],
-    ids=lambda page: str(page.relative_to(ROOT)),
-)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_prose_has_100_columns(page):
     """Longer lines are hard to review; tables, code and pictures cannot be wrapped."""
     assert [number for number, line in prose(page) if len(line) > COLUMNS] == []
 
 
-def test_every_page_of_the_lab_is_in_its_index():
-    """The journal's own table of contents."""
-    index = (ROOT / "docs/lab/README.md").read_text("utf-8")
-    pages = {path.name for path in (ROOT / "docs/lab").glob("*.md")} - {"README.md"}
-    assert {name for name in pages if f"]({name})" not in index} == set()
+def linked_pages(page: Path) -> set[Path]:
+    """Return the pages of the project that a page links to."""
+    targets = [match["target"].partition("#")[0] for match in LINK.finditer(page.read_text("utf-8"))]
+    return {path for target in targets if target and (path := (page.parent / target).resolve()) in PAGES}
+
+
+def test_every_page_is_reached_from_the_index():
+    """And the index from the README: nobody has to search the folder."""
+    index = ROOT / "docs/index.md"
+    reached, waiting = set(), [index]
+    while waiting:
+        page = waiting.pop()
+        if page not in reached:
+            reached.add(page)
+            waiting += linked_pages(page)
+    assert {page for page in PAGES if page.parent != ROOT} - reached == set()
+    assert index in linked_pages(ROOT / "README.md")
+
+
+@pytest.mark.parametrize("index", ["docs/index.md", "docs/lab/README.md"])
+def test_an_index_has_every_page_beside_it(index):
+    """One line per page of its folder."""
+    index = ROOT / index
+    assert set(index.parent.glob("*.md")) - {index} <= linked_pages(index)
+
+
+def python_blocks(page: Path) -> list[str]:
+    """Return the Python examples of a page."""
+    return re.findall(r"^```python\n(.*?)^```$", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def test_the_readme_has_the_first_example_of_the_python_page():
+    """That one runs in another test."""
+    assert python_blocks(ROOT / "README.md") == python_blocks(ROOT / "docs/python.md")[:1]
+
+
+def texts(folder: Path) -> set[str]:
+    """Return the literal parts of all strings in a folder's code, among them the fixed words of every message."""
+    trees = [ast.parse(path.read_text("utf-8")) for path in folder.rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    return {node.value.replace("%%", "%") for node in nodes if isinstance(node.value, str)}
+
+
+def test_quoted_messages_are_the_programs():
+    """A message that was reworded is reworded where the docs explain it; ``...`` stands for what varies."""
+    page = (ROOT / "docs/your-capture.md").read_text("utf-8")
+    messages = re.findall(r"^\| `(\.\.\. [^`]+)` \|", page, re.MULTILINE)
+    assert len(messages) >= 10
+    known = texts(ROOT / "mgavatar")
+    for message in messages:
+        for part in filter(None, (part.strip() for part in message.split("..."))):
+            assert any(part in text for text in known), message
 
 
 COMMANDS = re.compile(
@@ -106,8 +150,9 @@ def commands(page: Path) -> Iterator[tuple[str, list[str]]]:
         yield match["program"], ["1" if word == "N" else word for word in shlex.split(line)]
 
 
-CALLS = [words for page in PAGES for program, words in commands(page) if program == "mgavatar"]
-SCRIPTS = [(program, words) for page in PAGES for program, words in commands(page) if program != "mgavatar"]
+ALL = {(program, *words) for page in PAGES for program, words in commands(page)}
+CALLS = sorted(words for program, *words in ALL if program == "mgavatar")
+SCRIPTS = sorted((program, words) for program, *words in ALL if program != "mgavatar")
 
 
 @pytest.fixture
@@ -170,3 +215,34 @@ def test_commands_are_found(tmp_path):
     ]
     assert CALLS
     assert SCRIPTS
+
+
+CODE = re.compile(r"`([^`\n]+)`")
+FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+
+
+def known_flags(capsys, monkeypatch) -> set[str]:
+    """Return the flags of all commands, by their help texts, and of all tools, by their parameters."""
+    flags = {"--version"}
+    for command in cli._COMMANDS:
+        for wanted in ("--help", "--help-all") if command in ("fit", "demo") else ("--help",):
+            monkeypatch.setattr("sys.argv", ["mgavatar", command, wanted])
+            with pytest.raises(SystemExit):
+                cli.main()
+        flags |= set(FLAG.findall(capsys.readouterr().out))
+    for script in (ROOT / "tools").glob("*.py"):
+        for node in ast.walk(ast.parse(script.read_text("utf-8"))):
+            is_field = isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+            name = node.arg if isinstance(node, ast.arg) else node.target.id if is_field else ""
+            flags.add(f"--{name.replace('_', '-')}")
+    return flags
+
+
+def test_flags_in_the_text_exist(capsys, monkeypatch):
+    """A flag that was renamed is renamed in every sentence."""
+    known = known_flags(capsys, monkeypatch)
+    assert {"--budget", "--geometry.lambda-laplacian", "--camera", "--seeds"} <= known
+    for page in PAGES:
+        for code in CODE.findall(page.read_text("utf-8")):
+            if not code.startswith("pip "):
+                assert set(FLAG.findall(code)) <= known, f"{page.name}: {code}"
