@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mgavatar.avatar import Avatar
     from mgavatar.camera import Camera
     from mgavatar.capture.read import read_capture
-    from mgavatar.driving.motion import read_driving
+    from mgavatar.driving.read import read_driving
     from mgavatar.driving.render import render
     from mgavatar.errors import DataError
     from mgavatar.head.find import load_head_model
@@ -45,7 +45,7 @@ _HOMES = {
     "load_head_model": "mgavatar.head.find",
     "preset": "mgavatar.presets",
     "read_capture": "mgavatar.capture.read",
-    "read_driving": "mgavatar.driving.motion",
+    "read_driving": "mgavatar.driving.read",
     "render": "mgavatar.driving.render",
 }
 

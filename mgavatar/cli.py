@@ -187,7 +187,7 @@ def render(
     """
     from mgavatar.avatar import Avatar
     from mgavatar.device import find_device
-    from mgavatar.driving.motion import read_driving
+    from mgavatar.driving.read import read_driving
     from mgavatar.driving.render import render as run_render
     from mgavatar.driving.writers import default_name, kind_of
     from mgavatar.progress import Reporter

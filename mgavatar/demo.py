@@ -13,7 +13,7 @@ from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, check
 from mgavatar.device import find_device
-from mgavatar.driving.motion import read_driving
+from mgavatar.driving.read import read_driving
 from mgavatar.driving.render import render
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, make_folder, require_new_folder

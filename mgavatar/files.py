@@ -116,6 +116,15 @@ def read_npz(path: Path, *, wanted: Callable[[str], bool], max_bytes: int = GIBI
     return NpzContent(arrays, tuple(one_line(name, limit=40) for name in members if name not in chosen))
 
 
+def npz_names(path: Path) -> frozenset[str]:
+    """Return the names of the arrays of an ``.npz`` file, or none if the file is not a readable archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return frozenset(info.filename.removesuffix(".npy") for info in archive.infolist())
+    except Exception:  # whatever a damaged archive makes zipfile raise; who reads the file reports it
+        return frozenset()
+
+
 @dataclass(frozen=True)
 class _NpyHeader:
     """Type and shape of one member, and where its data starts."""

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from captures import write_capture
 
-from mgavatar.driving.motion import Driving, read_driving
+from mgavatar.driving.motion import Driving
+from mgavatar.driving.read import read_driving
 from mgavatar.driving.retarget import driving_expression
 from mgavatar.errors import DataError
 
@@ -101,7 +102,7 @@ def test_names_and_basis(tmp_path):
         ({"expr": np.ones((5, 4)), "jaw_pose": np.ones((3, 3))}, "jaw_pose has 3 frames but expr has 5"),
         ({"expr": np.full((5, 4), np.nan)}, "expr holds 20 values that are NaN"),
         ({"rotation": np.full((5, 3), 1e300)}, "rotation holds 15 values that are NaN or infinite"),
-        ({"rotation": np.ones((5, 3, 3))}, "rotation has shape (5, 3, 3), (T, 3) rotation vectors is needed"),
+        ({"rotation": np.ones((5, 3, 3))}, "rotation has shape (5, 3, 3), (T, 3) is needed: rotation vectors"),
         ({"eyes_pose": np.ones((5, 3))}, "eyes_pose has shape (5, 3), (T, 6)"),
         ({"expr": np.ones((0, 4))}, "expr has shape (0, 4)"),
         ({"expr": np.array(["a"])}, "numbers are needed"),
@@ -121,7 +122,7 @@ def test_refusals(tmp_path, arrays, words):
 def test_wrong_paths(tmp_path):
     refusal(lambda: read_driving(tmp_path / "nothing.npz"), "nothing.npz: no such file")
     refusal(lambda: read_driving(tmp_path / "nothing"), "nothing: no such file")
-    refusal(lambda: read_driving(tmp_path), f"{tmp_path}: no .npz files in this folder")
+    refusal(lambda: read_driving(tmp_path), f"{tmp_path}: no motion in this folder, which has no files")
     (tmp_path / "seq.npz").write_bytes(b"PK\x03\x04 not really")
     refusal(lambda: read_driving(tmp_path / "seq.npz"), "seq.npz: not a readable .npz file")
 

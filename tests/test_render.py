@@ -21,7 +21,8 @@ from mgavatar.avatar import Avatar
 from mgavatar.camera import look_at
 from mgavatar.capture.read import read_capture
 from mgavatar.driving.cameras import cameras_of
-from mgavatar.driving.motion import Driving, read_driving
+from mgavatar.driving.motion import Driving
+from mgavatar.driving.read import read_driving
 from mgavatar.driving.render import render
 from mgavatar.driving.retarget import driving_notes, head_points, poses_of
 from mgavatar.driving.writers import EMPTY_DEPTH, to_bytes, write_exr

@@ -22,7 +22,7 @@ from mgavatar.camera import look_at
 from mgavatar.capture.images import read_images
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, GeometryConfig
-from mgavatar.driving.motion import read_driving
+from mgavatar.driving.read import read_driving
 from mgavatar.driving.writers import to_bytes
 from mgavatar.reporting.charts import loss_chart, read_history
 from mgavatar.reporting.page import config_changes, templates, write_report
