@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
 from mgavatar.driving.cameras import cameras_of
-from mgavatar.driving.motion import read_driving
+from mgavatar.driving.read import read_driving
 from mgavatar.driving.retarget import poses_of
 from mgavatar.driving.writers import kind_of, to_bytes
 from mgavatar.errors import DataError
