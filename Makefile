@@ -1,9 +1,10 @@
 # Everything sets itself up: a machine with Python >= 3.11 and make is enough.
 PYTHON ?= python3
-# The CPU build; on a CUDA machine: make TORCH=torch
+# The CPU build of torch. On a machine with CUDA: make TORCH_INDEX=
 TORCH ?= torch==2.13.0
-TORCH_INDEX ?=
+TORCH_INDEX ?= --index-url https://download.pytorch.org/whl/cpu
 VENV ?= .venv
+PACKAGE ?= -e ".[dev,video]"
 DEMO ?= demo_out
 
 .PHONY: demo test venv lint clean
@@ -22,11 +23,12 @@ lint: venv
 
 venv: $(VENV)/.ready
 
-# torch first: otherwise a dependency pulls in a build with gigabytes of CUDA libraries.
+# torch comes first and alone: as a dependency of the package, it would be the build with gigabytes of CUDA libraries.
+# What torch itself needs comes with the package.
 $(VENV)/.ready: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -q $(TORCH_INDEX) "$(TORCH)"
-	$(VENV)/bin/python -m pip install -q -e ".[dev,video]"
+	$(VENV)/bin/python -m pip install -qq --retries 1 --no-deps $(TORCH_INDEX) "$(TORCH)"
+	$(VENV)/bin/python -m pip install -q $(PACKAGE)
 	touch $@
 
 clean:

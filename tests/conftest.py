@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
 
 DATA = Path(os.environ.get("MGAVATAR_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 """Real sample data; it is not part of the project, so tests that want it say when it is absent."""
+
+
+_OPEN_FILES = Path("/proc/self/fd")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -30,6 +35,33 @@ def pytest_report_header(config: pytest.Config) -> str:
 def device(request: pytest.FixtureRequest) -> torch.device:
     """Every device that this machine has."""
     return torch.device(request.param)
+
+
+@pytest.fixture(autouse=True)
+def _windows_rule(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse to remove or replace a file that this process has open, as Windows does, also where Linux would not."""
+    if not _OPEN_FILES.is_dir():
+        return
+
+    def refusing(call: Callable[..., None]) -> Callable[..., None]:
+        def checked(*args: Any, **kwargs: Any) -> None:
+            for path in args[:2]:
+                if os.path.realpath(path) in _open_files():
+                    raise PermissionError(13, "open in this process, which Windows does not allow", str(path))
+            call(*args, **kwargs)
+
+        return checked
+
+    for name in ("remove", "rename", "replace", "unlink"):
+        monkeypatch.setattr(os, name, refusing(getattr(os, name)))
+
+
+def _open_files() -> set[str]:
+    found = set()
+    for descriptor in os.listdir(_OPEN_FILES):
+        with contextlib.suppress(OSError):  # the listing itself is closed by now
+            found.add(os.readlink(_OPEN_FILES / descriptor))
+    return found
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 from collections.abc import Callable
 from dataclasses import replace
@@ -241,7 +240,7 @@ class Timed:
             self.advances[stage.name].append(args[4] if len(args) > 4 else 1.0)
             self.last[stage.name] = stage
             if self.stop_at == (stage.name, len(self.advances[stage.name])):
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
             return step(stage, *args)
 
         return stepped

@@ -263,7 +263,8 @@ def test_nonsense_in_a_frame(root, change):
 def test_paths_that_lead_elsewhere(tmp_path, path, key):
     root = write_capture(tmp_path / "inner/subject")
     (tmp_path / "secret.png").write_bytes((root / "images/00000_00.png").read_bytes())
-    os.mkfifo(root / "pipe")
+    if hasattr(os, "mkfifo"):  # elsewhere the name leads nowhere, which is refused too
+        os.mkfifo(root / "pipe")
     edit_frame(root, **{key: path})
     refusal(lambda: read_capture(root), "transforms_train.json: frame ")
 

@@ -299,7 +299,7 @@ def test_ctrl_c_exits_with_130_and_says_how_to_go_on(work, mgavatar, monkeypatch
     def stepped(self: GeometryStage, *args: Any) -> Any:
         steps.append(1)
         if len(steps) == 5:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         return step(self, *args)
 
     with monkeypatch.context() as patch:

@@ -70,10 +70,10 @@ class Summary:
 
 
 def peak_mib() -> float | None:
-    """Return the most memory that this process has held [MiB], or None where Python cannot tell (Windows)."""
-    try:
-        import resource
-    except ImportError:
+    """Return the most memory that this process has held [MiB], or None on Windows, where Python does not know."""
+    if sys.platform == "win32":
         return None
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (2**20 if sys.platform == "darwin" else 2**10), 1)
