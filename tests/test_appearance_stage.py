@@ -13,17 +13,19 @@ from scipy.spatial.transform import Rotation
 from tiny import WHITE, run, tiny_config, tiny_personal_head
 from torch import Tensor
 
+from mgavatar.appearance import model
 from mgavatar.appearance.color_net import ColorNet
 from mgavatar.appearance.face_gaussians import PARAMETERS, FaceFrames, face_uvs
 from mgavatar.appearance.model import Appearance, PosedMesh, build_appearance
-from mgavatar.appearance.offset_net import N_THETA, OffsetNet
+from mgavatar.appearance.offset_net import N_THETA, OffsetNet, Upsample
 from mgavatar.appearance.stage import AppearanceStage, binding_loss
 from mgavatar.camera import Camera
 from mgavatar.capture.subject import Subject
-from mgavatar.config import AppearanceConfig, FitConfig
+from mgavatar.config import AppearanceConfig, FitConfig, HeadTuningConfig, ShConfig
 from mgavatar.gaussians import draw
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Body
+from mgavatar.kernels.uv_map import position_map
 from mgavatar.losses import image_loss
 
 NO_DENSITY = replace(tiny_config().appearance.density, start=10**6)
@@ -120,6 +122,72 @@ def test_offset_net_sees_all_of_its_inputs():
             assert not torch.allclose(net(*others), before), index
         net.latent += 0.5
         assert not torch.allclose(net(*inputs), before)
+
+
+class Recorder(torch.nn.Module):
+    """Stands for OffsetNet and keeps what it was given."""
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        self.inputs = inputs
+        return torch.zeros(13, 32, 32)
+
+
+def test_offset_net_is_given_the_maps_and_the_pose(subject, views):
+    """Eq. 10: M_cano, M_pose, and theta with all five rotations, that of the root too."""
+    appearance = make_appearance(subject)
+    appearance.offset_net = Recorder()
+    frozen = appearance.frozen
+    pose = frozen.head.pose(1)
+    values = torch.linspace(0.01, 0.15, 15)
+    root, neck, jaw, eyes = values.split([3, 3, 3, 6])
+    posed = frozen.posed(replace(pose, rotation=root, neck_pose=neck, jaw_pose=jaw, eyes_pose=eyes))
+    appearance(posed, views.cameras[0])
+    canonical_map, pose_map, theta = appearance.offset_net.inputs
+    assert torch.equal(canonical_map, frozen.canonical_map)
+    assert torch.equal(pose_map, posed.pose_map)
+    assert not torch.allclose(canonical_map, pose_map)
+    assert torch.equal(theta, values)
+
+
+def test_the_layers_of_offset_net():
+    """Leaky activations between all layers, and a latent map that starts with texture of its own."""
+    torch.manual_seed(0)
+    net = OffsetNet(tiny_config().appearance.offset_net)
+    kinds = [type(module).__name__ for module in net.modules()]
+    assert kinds.count("Conv2d") == 1 + 8 + 5
+    assert kinds.count("LeakyReLU") == 1 + 8 + 4 + 1
+    assert "ReLU" not in kinds
+    assert {module.negative_slope for module in net.modules() if hasattr(module, "negative_slope")} == {0.1}
+    assert net.latent.std().item() == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 4), (16, 16)])
+def test_upsampling_is_that_of_torch(size):
+    """The values of ``nn.Upsample`` to the bit, and its adjoint in double precision."""
+    rng = torch.Generator().manual_seed(size[0])
+    maps = torch.randn(2, 3, *size, generator=rng, dtype=torch.float64, requires_grad=True)
+    results = []
+    for up in (Upsample(), torch.nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)):
+        out = up(maps)
+        weights = torch.randn(out.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        results.append((out, *torch.autograd.grad((out * weights).sum(), maps)))
+    assert torch.equal(results[0][0], results[1][0])
+    assert torch.allclose(results[0][1], results[1][1], rtol=1e-13, atol=1e-13)
+
+
+def test_convolutions_are_deterministic_in_both_directions(subject, views, monkeypatch):
+    """cuDNN is told so for the forward and the backward pass of a step, and gets its setting back."""
+    stage = make_stage(subject)
+    seen: list[bool] = []
+
+    def note(*_: object) -> None:
+        seen.append(torch.backends.cudnn.deterministic)
+
+    stage.appearance.offset_net.last.register_forward_hook(note)
+    stage.appearance.offset_net.latent.register_hook(note)
+    run(stage, views, 1)
+    assert seen == [True, True]
+    assert torch.backends.cudnn.deterministic is False
 
 
 def test_offsets_change_what_they_say(subject, views):
@@ -400,6 +468,49 @@ def test_position_maps_show_the_face_without_its_root_motion(subject):
     assert base.theta.shape == (N_THETA,)
 
 
+def test_position_maps_are_in_units_of_the_largest_side(subject):
+    """Centred on the canonical head, its largest half side is 1 on every axis alike."""
+    frozen = make_appearance(subject).frozen
+    low, high = frozen.canonical.min(0).values, frozen.canonical.max(0).values
+    rng = torch.Generator().manual_seed(0)
+    verts = torch.randn(frozen.canonical.shape, generator=rng)
+    expected = position_map(frozen._uv, (verts - 0.5 * (low + high)) / (0.5 * (high - low).max()))
+    assert torch.allclose(frozen._map(verts), expected, atol=1e-6)
+    assert torch.equal(frozen.canonical_map, frozen._map(frozen.canonical))
+
+
+def test_the_box_of_the_colour_field(subject):
+    """A twentieth of the head's size on every side: no cells are wasted on air."""
+    appearance = make_appearance(subject)
+    low, high = appearance.frozen.canonical.min(0).values, appearance.frozen.canonical.max(0).values
+    assert torch.allclose(appearance.color_net.low, low - 0.05 * (high - low), atol=1e-7)
+    assert torch.allclose(appearance.color_net.size, 1.1 * (high - low), atol=1e-6)
+
+
+def test_colours_stay_with_the_canonical_place(subject, views):
+    """Without view directions, a Gaussian has one colour in all poses."""
+    color_net = replace(tiny_config().appearance.color_net, view_frame="none")
+    appearance = make_appearance(subject, tiny_config(appearance={"color_net": color_net}))
+    with torch.no_grad():
+        appearance.color_net.grid.table.uniform_(-5.0, 5.0, generator=torch.Generator().manual_seed(0))
+    first, second = (appearance(appearance.frozen.at_timestep(t), views.cameras[0])[0] for t in (0, 1))
+    assert not torch.allclose(first.means, second.means)
+    assert torch.equal(first.colors, second.colors)
+    assert first.colors.std() > 0.01
+
+
+def test_few_posed_meshes_are_kept(subject, monkeypatch):
+    """Those used last; a long capture would fill the memory otherwise."""
+    monkeypatch.setattr(model, "_CACHED_POSES", 2)
+    frozen = make_appearance(subject).frozen
+    first = frozen.at_timestep(0)
+    frozen.at_timestep(1)
+    assert frozen.at_timestep(0) is first
+    frozen.at_timestep(2)
+    assert list(frozen._posed) == [0, 2]
+    assert frozen.at_timestep(0) is first
+
+
 def test_a_head_whose_atlas_has_faces_without_area(subject):
     """Faces that collapse in UV space (as on a projected atlas) leave no NaN in the maps."""
     config = tiny_config()
@@ -441,16 +552,69 @@ def test_the_yardstick_is_the_mesh(subject):
     assert stage.density.extent == pytest.approx(diagonal)
 
 
-def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
-    """Each group its own rate, and all of them the stated share of it at the end."""
-    stage = make_stage(
-        subject, tiny_config(appearance={"iterations": 5, "lr_final_factor": 0.5, "density": NO_DENSITY})
-    )
-    a = stage.config.appearance
-    start = [a.lr_means, a.lr_scales, a.lr_quats, a.lr_opacities, a.color_net.lr, a.offset_net.lr]
-    assert [group["lr"] for group in stage.optimizer.param_groups] == start
+RATES = {
+    "gaussians.local_means": 1.1e-3,
+    "gaussians.log_scales": 1.3e-3,
+    "gaussians.quats": 1.7e-3,
+    "gaussians.opacity_logits": 1.9e-3,
+    "gaussians.sh_constant": 2.3e-3,
+    "gaussians.sh_others": 2.3e-3 / 20.0,
+    "color_net.mlp": 2.9e-3,
+    "offset_net": 3.1e-3,
+    "expr": 3.7e-3,
+    "rotation": 4.1e-3,
+    "neck_pose": 4.1e-3,
+    "jaw_pose": 4.1e-3,
+    "eyes_pose": 4.1e-3,
+    "translation": 4.3e-3,
+}
+"""A rate of its own for everything that learns, by the beginning of its name."""
+
+
+@pytest.mark.parametrize("colors", ["color_net", "sh"])
+def test_everything_learns_at_its_own_rate_and_all_rates_fall(subject, views, colors):
+    """No two are exchanged, none is left out, and each ends at the stated share of itself."""
+    tiny = tiny_config().appearance
+    config = tiny_config(
+        appearance={
+            "iterations": 5, "lr_final_factor": 0.5, "density": NO_DENSITY, "colors": colors, "lr_means": 1.1e-3,
+            "lr_scales": 1.3e-3, "lr_quats": 1.7e-3, "lr_opacities": 1.9e-3, "sh": ShConfig(lr=2.3e-3),
+            "color_net": replace(tiny.color_net, lr=2.9e-3), "offset_net": replace(tiny.offset_net, lr=3.1e-3),
+            "head_tuning": HeadTuningConfig(enabled=True, lr_expr=3.7e-3, lr_pose=4.1e-3, lr_translation=4.3e-3),
+        }
+    )  # fmt: skip
+    stage = make_stage(subject, config)
+    names = dict(stage.appearance.named_parameters()) | dict(stage.poses.items())
+    names.pop("color_net.grid.table", None)  # has an optimizer of its own
+    expected = {name: next(rate for start, rate in RATES.items() if name.startswith(start)) for name in names}
+
+    def rates() -> dict[str, float]:
+        of = {id(p): group["lr"] for group in stage.optimizer.param_groups for p in group["params"]}
+        assert len(of) == len(names)
+        return {name: of[id(parameter)] for name, parameter in names.items()}
+
+    assert rates() == pytest.approx(expected, rel=1e-12)
     run(stage, views, 5)
-    assert [group["lr"] for group in stage.optimizer.param_groups] == pytest.approx([0.5 * lr for lr in start])
+    assert rates() == pytest.approx({name: 0.5 * rate for name, rate in expected.items()}, rel=1e-6)
+    assert stage.optimizer.defaults["eps"] == 1e-15  # gradients of hidden Gaussians are as small as 1e-8
+
+
+def test_the_hash_grid_follows_the_schedule(subject, views, monkeypatch):
+    """Its own optimizer takes the rate of the place in the schedule, whatever the length of the steps."""
+    color_net = replace(tiny_config().appearance.color_net, lr=0.02)
+    config = tiny_config(
+        appearance={"iterations": 8, "lr_final_factor": 0.1, "density": NO_DENSITY, "color_net": color_net}
+    )
+    stage = make_stage(subject, config)
+    rates: list[float] = []
+    monkeypatch.setattr(stage.appearance.color_net.grid, "adam_step", rates.append)
+    target = views.target(0, WHITE, WHITE)
+    for schedule_step in (1.0, 0.5, 2.5, 4.0):
+        stage.step(views.cameras[0], views.timesteps[0], target, WHITE, schedule_step)
+    assert rates == pytest.approx([0.02 * 0.1 ** (position / 8) for position in (0.0, 1.0, 1.5, 4.0)])
+    assert stage.position == 8.0
+    lr = {group["lr"] for group in stage.optimizer.param_groups}
+    assert min(lr) == pytest.approx(0.1 * min(config.appearance.lr_quats, config.appearance.offset_net.lr))
 
 
 @pytest.mark.parametrize("steps", [3, 6])
@@ -465,6 +629,32 @@ def test_a_stage_goes_on_from_its_state(subject, views, steps):
     assert steps[0] == steps[1]
     for (name, a), b in zip(stage.appearance.named_parameters(), other.appearance.parameters(), strict=True):
         assert torch.equal(a, b), name
+
+
+def test_loaded_poses_replace_the_meshes_that_are_kept(subject, views):
+    """A state with other poses is drawn in them."""
+    stage, other = make_stage(subject), make_stage(subject)
+    before = other.appearance.frozen.at_timestep(0).verts
+    with torch.no_grad():
+        stage.poses["neck_pose"] += 0.3
+    other.load_state_dict(copy.deepcopy(stage.state_dict()))
+    assert torch.equal(other.poses["neck_pose"], stage.poses["neck_pose"])
+    after = other.appearance.frozen.at_timestep(0).verts
+    assert torch.equal(after, stage.appearance.frozen.at_timestep(0).verts)
+    assert not torch.allclose(after, before)
+
+
+def test_density_control_gets_canonical_sizes_and_ends(subject, views, monkeypatch):
+    """Sizes are those of the canonical faces, not of a pose; after the last round nothing is collected."""
+    stage = make_stage(subject)
+    given: list[Tensor] = []
+    monkeypatch.setattr(stage.density, "refine", lambda optimizer, scales: given.append(scales))
+    run(stage, views, 8)
+    assert len(given) == 2
+    assert all(torch.equal(scales, stage.appearance.frozen.frames.scales) for scales in given)
+    stage.density.reset()
+    run(stage, views, 3)
+    assert not stage.density.seen.any()
 
 
 def test_a_loaded_state_of_the_same_size_replaces_what_was_prepared(subject, views):

@@ -46,11 +46,13 @@ PAPER = {
     "geometry.lr_triplane": 1e-3,  # RefineNet is triplane and networks
     "geometry.lambda_offset": 10.0,  # lambda_o, Eq. 7
     "geometry.lambda_laplacian": 1e5,  # lambda_l, Eq. 7
+    "geometry.max_image_size": 8192,  # nothing is reduced
     "geometry.hidden": 128,
     "geometry.pose_offsets": True,
     "geometry.surface_shift": 0.0,  # Gaussians are at the vertices
     "geometry.scales_follow_mesh": False,
     "appearance.iterations": 240_000,  # 340k in all
+    "appearance.max_image_size": 8192,
     "appearance.lambda_position": 0.01,  # lambda_mu, Eq. 11
     "appearance.lambda_scale": 1.0,  # lambda_s, Eq. 11
     "appearance.epsilon_position": 1.0,  # epsilon_mu, Eq. 11

@@ -250,6 +250,15 @@ def test_gradients_are_averaged_over_the_views_that_see_a_gaussian():
     assert scene.density.seen.tolist() == [1.0] * N_FACES
 
 
+def test_the_mean_decides_not_the_sum():
+    """Four views with three quarters of the threshold each refine nothing; one with twice as much does."""
+    scene = Scene()
+    scene.density.total = torch.tensor([3.0, 0.0, 0.0, 6.0, 1.01, 0.0])
+    scene.density.seen = torch.tensor([4.0, 0.0, 0.0, 4.0, 1.0, 9.0])
+    scene.density.refine(scene.optimizer, FACE_SCALES)
+    assert scene.gaussians.face_ids.tolist() == [*range(N_FACES), 3, 4]
+
+
 def test_refining_forgets_what_was_collected():
     """The next round starts anew, with a row for every Gaussian there now is."""
     scene = Scene()

@@ -100,6 +100,35 @@ def test_pose_offsets_are_the_network_of_features_and_pose():
     assert torch.allclose(net.pose_offsets(features, pose), config.offset_unit * plain, atol=1e-7)
 
 
+def test_identity_offsets_are_the_network_of_features():
+    """Eq. 1 in units of ``offset_unit``."""
+    torch.manual_seed(3)
+    config = tiny_config(geometry={"offset_unit": 0.02}).geometry
+    net = RefineNet(torch.rand(30, 3), config)
+    torch.nn.init.normal_(net.phi_id[-1].weight)
+    features = net.encode()
+    assert features.std().item() == pytest.approx(0.1, rel=0.5)
+    plain = net.phi_id(features)
+    assert plain.abs().max() > 0.1
+    assert torch.allclose(net.identity_offsets(features), 0.02 * plain, atol=1e-7)
+
+
+def test_pose_offsets_are_given_neck_jaw_and_eyes(subject, monkeypatch):
+    """Eq. 2: all twelve numbers, in this order, in radians, and nothing of the root or the expression."""
+    head = make_stage(subject, tiny_config()).gaussians.head
+    given: list[torch.Tensor] = []
+
+    def record(features: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
+        given.append(pose)
+        return torch.zeros(len(features), 3)
+
+    monkeypatch.setattr(head.refine, "pose_offsets", record)
+    values = torch.linspace(0.01, 0.12, N_POSE)
+    neck, jaw, eyes = values.split([3, 3, 6])
+    head.posed(replace(head.pose(0), neck_pose=neck, jaw_pose=jaw, eyes_pose=eyes))
+    assert torch.equal(given[0], values)
+
+
 def test_offsets_add_up_before_posing(subject):
     """Eq. 3: the posed head is the parametric one plus both offsets, on joints that only identity moves."""
     head = make_stage(subject, tiny_config()).gaussians.head
@@ -151,6 +180,18 @@ def test_gaussians_start_at_a_share_of_the_edges(subject):
     edges = gaussians.head.body.edge_lengths(gaussians.head.body.shaped(gaussians.head.betas))
     assert torch.allclose(gaussians.log_scales.exp(), 0.5 * edges, rtol=1e-5)
     assert not gaussians.colors.any()
+
+
+def test_no_gaussian_starts_without_size(subject, monkeypatch):
+    """Where vertices meet in a point, edges count as a fifth of the median edge; they do so when the mesh moves too."""
+    head = make_stage(subject, tiny_config()).gaussians.head
+    edges = torch.full((head.body.n_verts,), 0.01)
+    edges[:3] = torch.tensor([0.0, 0.001, 0.02])
+    monkeypatch.setattr(head.body, "edge_lengths", lambda verts: edges)
+    config = tiny_config(geometry={"initial_scale": 0.5, "scales_follow_mesh": True})
+    gaussians = VertexGaussians(head, config)
+    assert torch.allclose(gaussians.log_scales[:4].exp(), 0.5 * torch.tensor([0.002, 0.002, 0.02, 0.01]))
+    assert torch.allclose(gaussians.scales(head.posed(head.pose(0))), gaussians.log_scales.exp())
 
 
 def test_gaussians_are_drawn_behind_the_surface(subject, views):
@@ -380,15 +421,46 @@ def test_a_timestep_that_is_not_trained_stays_as_tracked(subject, views):
         assert not torch.equal(value[sorted(trained)], before[name][sorted(trained)]), name
 
 
-def test_learning_rates_are_those_of_the_config_and_fall(subject, views):
-    """Each group its own rate, and all of them the stated share of it at the end."""
-    config = tiny_config(geometry={"iterations": 10, "lr_final_factor": 0.25})
+RATES = {
+    "head.refine.phi": ("lr_refine", 1.1e-3),
+    "head.refine.planes": ("lr_triplane", 1.3e-3),
+    "head.betas": ("lr_shape", 1.7e-3),
+    "head.poses.expr": ("lr_expr", 1.9e-3),
+    "head.poses.translation": ("lr_translation", 2.3e-3),
+    "head.poses": ("lr_pose", 2.9e-3),
+    "log_scales": ("lr_scale", 3.1e-3),
+    "colors": ("lr_color", 3.7e-3),
+}
+"""A rate of its own for everything that learns, by the beginning of its name; the first that fits counts."""
+
+
+def test_everything_learns_at_its_own_rate_and_all_rates_fall(subject, views):
+    """No two are exchanged, none is left out, and each ends at the stated share of itself."""
+    config = tiny_config(geometry={"iterations": 10, "lr_final_factor": 0.25} | dict(RATES.values()))
     stage = make_stage(subject, config)
-    g = config.geometry
-    start = [g.lr_refine, g.lr_triplane, g.lr_shape, g.lr_expr, g.lr_pose, g.lr_translation, g.lr_scale, g.lr_color]
-    assert [group["lr"] for group in stage.optimizer.param_groups] == start
-    run(stage, views, 10)
-    assert [group["lr"] for group in stage.optimizer.param_groups] == pytest.approx([0.25 * lr for lr in start])
+    names = dict(stage.gaussians.named_parameters())
+    expected = {name: next(rate for start, (_, rate) in RATES.items() if name.startswith(start)) for name in names}
+
+    def rates() -> dict[str, float]:
+        of = {id(p): group["lr"] for group in stage.optimizer.param_groups for p in group["params"]}
+        assert len(of) == len(names)
+        return {name: of[id(parameter)] for name, parameter in names.items()}
+
+    assert rates() == pytest.approx(expected, rel=1e-12)
+    target = views.target(0, WHITE, WHITE)
+    for schedule_step in (1.0, 0.5, 4.5, 4.0):  # as a budget has it
+        stage.step(views.cameras[0], views.timesteps[0], target, WHITE, schedule_step)
+    assert stage.position == 10.0
+    assert rates() == pytest.approx({name: 0.25 * rate for name, rate in expected.items()}, rel=1e-6)
+    assert stage.optimizer.defaults["eps"] == 1e-15  # the Gaussians' gradients are as small as 1e-8
+
+
+def test_a_mesh_that_is_not_finite_is_noticed(subject, views):
+    """Its Gaussians are not drawn, so the images alone would not show it."""
+    stage = make_stage(subject, tiny_config())
+    with torch.no_grad():
+        stage.gaussians.head.poses["translation"][views.timesteps[0], 1] = torch.nan
+    assert np.isnan(run(stage, views, 1)[0]["loss"])
 
 
 def test_a_stage_goes_on_from_its_state(subject, views):

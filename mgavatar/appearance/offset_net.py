@@ -2,14 +2,71 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
 
 from mgavatar.config import ResolvedOffsetNetConfig
 from mgavatar.kernels.binding import N_OFFSETS
 
 N_THETA = 15
 """Rotations of root, neck, jaw and both eyes."""
+
+
+@contextlib.contextmanager
+def deterministic_convolutions() -> Iterator[None]:
+    """Let cuDNN use only algorithms that give the same bits on every run, forward and backward, inside the block."""
+    before = torch.backends.cudnn.deterministic
+    torch.backends.cudnn.deterministic = True
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.deterministic = before
+
+
+class _UpsampleFunction(torch.autograd.Function):
+    """Bilinear upsampling by two with an adjoint that gathers, so that it has the same bits on every run.
+
+    torch's own adjoint adds with atomics on CUDA.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, maps: Tensor) -> Tensor:
+        return functional.interpolate(maps, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return _gather_pairs(_gather_pairs(grad, 2), 3)
+
+
+def _gather_pairs(grad: Tensor, dim: int) -> Tensor:
+    """Apply the adjoint of linear upsampling by two along one dimension.
+
+    Input i is read by outputs 2i and 2i + 1 with weight 3/4, and by their outer neighbours 2i - 1 and 2i + 2 with 1/4.
+    The first and the last input are read with 1/4 more by their own outputs, whose outer neighbour is missing.
+    """
+    n = grad.shape[dim] // 2
+    even, odd = grad.unflatten(dim, (n, 2)).unbind(dim + 1)
+    out = (even + odd).mul_(0.75)
+    out.narrow(dim, 1, n - 1).add_(odd.narrow(dim, 0, n - 1), alpha=0.25)
+    out.narrow(dim, 0, n - 1).add_(even.narrow(dim, 1, n - 1), alpha=0.25)
+    out.select(dim, 0).add_(even.select(dim, 0), alpha=0.25)
+    out.select(dim, n - 1).add_(odd.select(dim, n - 1), alpha=0.25)
+    return out
+
+
+class Upsample(nn.Module):
+    """Bilinear upsampling by two, as ``nn.Upsample`` without aligned corners, deterministic on every device."""
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return maps [N, C, H, W] as [N, C, 2 H, 2 W]."""
+        return _UpsampleFunction.apply(maps)
 
 
 def _conv(n_in: int, n_out: int, stride: int = 1) -> nn.Sequential:
@@ -33,10 +90,10 @@ class OffsetNet(nn.Module):
             _conv(c, c, 2), _conv(c, c), _conv(c, c), _conv(c, c),
         )  # fmt: skip
         self.encode_pose = nn.Sequential(nn.Linear(N_THETA, c // 2), nn.LeakyReLU(0.1), nn.Linear(c // 2, c // 2))
-        up = nn.Upsample(scale_factor=2, mode="bilinear", align_corners=False)
         self.decoder = nn.Sequential(
-            _conv(c + c // 2, c), up, _conv(c, c), up, _conv(c, c // 2), up, _conv(c // 2, c // 2)
-        )
+            _conv(c + c // 2, c), Upsample(), _conv(c, c), Upsample(),
+            _conv(c, c // 2), Upsample(), _conv(c // 2, c // 2),
+        )  # fmt: skip
         self.last = nn.Conv2d(c, N_OFFSETS, 3, padding=1)
         nn.init.zeros_(self.last.weight)
         assert self.last.bias is not None  # noqa: S101  for the type checker

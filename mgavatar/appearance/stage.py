@@ -10,6 +10,7 @@ from torch import Tensor
 from mgavatar.appearance.density import DensityControl
 from mgavatar.appearance.face_gaussians import SH_PARAMETERS
 from mgavatar.appearance.model import Appearance, PosedMesh
+from mgavatar.appearance.offset_net import deterministic_convolutions
 from mgavatar.camera import Camera
 from mgavatar.config import ResolvedAppearanceConfig, ResolvedConfig
 from mgavatar.gaussians import draw
@@ -85,16 +86,19 @@ class AppearanceStage:
     ) -> dict[str, float]:
         """Take one optimizer step on Eq. 11, as in :meth:`mgavatar.fitting.stage.Stage.step`."""
         a, appearance = self.config.appearance, self.appearance
-        gaussians, maps = appearance(self._posed(timestep), camera)
-        screen_grads = torch.zeros(len(gaussians.means), 2, device=target.device)
-        rendering = draw(gaussians, camera, background=background, config=self.config.raster, screen_grads=screen_grads)
-        image_term = image_loss(rendering.image, target, self.config.loss)
-        g = appearance.gaussians
-        binding_term = binding_loss(g.local_means, g.log_scales.exp(), rendering.visible, a)
-        offset_term = a.offset_net.regularize * maps.square().mean() if maps is not None else 0.0 * image_term
-        loss = image_term + binding_term + offset_term
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        with deterministic_convolutions():
+            gaussians, maps = appearance(self._posed(timestep), camera)
+            screen_grads = torch.zeros(len(gaussians.means), 2, device=target.device)
+            rendering = draw(
+                gaussians, camera, background=background, config=self.config.raster, screen_grads=screen_grads
+            )
+            image_term = image_loss(rendering.image, target, self.config.loss)
+            g = appearance.gaussians
+            binding_term = binding_loss(g.local_means, g.log_scales.exp(), rendering.visible, a)
+            offset_term = a.offset_net.regularize * maps.square().mean() if maps is not None else 0.0 * image_term
+            loss = image_term + binding_term + offset_term
+            self.optimizer.zero_grad(set_to_none=True)
+            loss.backward()
         self.optimizer.step()
         if appearance.color_net is not None:
             appearance.color_net.grid.adam_step(a.color_net.lr * self.decay**self.position)
