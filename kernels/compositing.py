@@ -71,10 +71,8 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     def composite_kernel(
         # In:
         splats: wp.array2d[real],  # [N, 16] projection.SPLAT
-        tile_begin: wp.array[wp.int32],  # [T]
-        tile_end: wp.array[wp.int32],  # [T]
-        isect_ids: wp.array[wp.int32],  # [M] intersections by tile, front to back
-        gaussian_ids: wp.array[wp.int32],  # [M] by intersection
+        isect_offsets: wp.array[wp.int32],  # [T + 1] first entry of each tile in the lists
+        gaussian_ids: wp.array[wp.int32],  # [M] by tile, front to back
         background: wp.array2d[real],  # [B, 3]
         n_columns: int,
         tiles_per_view: int,
@@ -86,7 +84,7 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         alphas: wp.array3d[real],  # [B, H, W]
         depths: wp.array3d[real],  # [B, H, W] sum of weight times depth
         final_T: wp.array3d[real],  # [B, H, W]
-        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of isect_ids blended last, -1 if none
+        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of the lists blended last, -1 if none
     ):
         thread = wp.tid()
         tile = thread // BLOCK
@@ -99,9 +97,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
         T = real(1.0)
         red, green, blue, depth = real(0.0), real(0.0), real(0.0), real(0.0)
         accepted = wp.int32(-1)
-        for k in range(tile_begin[tile], tile_end[tile]):
+        for k in range(isect_offsets[tile], isect_offsets[tile + 1]):
             if T >= stop:
-                n = gaussian_ids[isect_ids[k]]
+                n = gaussian_ids[k]
                 alpha = wp.min(cap, splats[n, 7] * gaussian(splats, n, offset(splats, n, x, y)))
                 if alpha >= alpha_threshold:
                     weight = alpha * T
@@ -123,10 +121,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
     def composite_bwd_kernel(
         # In:
         splats: wp.array2d[real],  # [N, 16]
-        tile_begin: wp.array[wp.int32],  # [T]
-        tile_end: wp.array[wp.int32],  # [T]
-        isect_ids: wp.array[wp.int32],  # [M]
-        gaussian_ids: wp.array[wp.int32],  # [M]
+        isect_offsets: wp.array[wp.int32],  # [T + 1]
+        gaussian_ids: wp.array[wp.int32],  # [M] by tile, front to back
+        isect_ids: wp.array[wp.int32],  # [M] row of partials of each entry
         background: wp.array2d[real],  # [B, 3]
         n_columns: int,
         tiles_per_view: int,
@@ -160,9 +157,9 @@ def _kernels(real: Any) -> tuple[wp.Kernel, wp.Kernel]:
             )
             accepted = last_ids[b, y, x]
         # All threads of the block walk all entries of the tile: the block sums need every one of them.
-        for step in range(tile_end[tile] - tile_begin[tile]):
-            k = tile_end[tile] - 1 - step
-            n = gaussian_ids[isect_ids[k]]
+        for step in range(isect_offsets[tile + 1] - isect_offsets[tile]):
+            k = isect_offsets[tile + 1] - 1 - step
+            n = gaussian_ids[k]
             active = bool(False)
             grad = row10()
             if k <= accepted:

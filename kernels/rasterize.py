@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from mgavatar.kernels import bridge, compositing, compositing_rows, projection
+from mgavatar.kernels import bridge, compositing, compositing_blocks, projection
 from mgavatar.kernels.tiling import MAX_ISECTS, WorkLists, build_work_lists
 
-Form = Literal["auto", "plain", "rows"]
+Form = Literal["auto", "plain", "blocks"]
 
 LEAST_STOP = 1e-30
 """Transmittance that ends a pixel where ``stop`` is 0: below it T would underflow, and the adjoint starts from T."""
@@ -36,9 +36,9 @@ class RasterSettings:
     near: float = 0.01
     """Gaussians nearer than this are not drawn [m]."""
     form: Form = "auto"
-    """``plain`` is one thread per pixel, on any device and dtype; ``rows`` is the CPU's vector form in float32."""
+    """``plain`` is one thread per pixel, on any device and dtype; ``blocks`` is the CPU's vector form in float32."""
     exp: Literal["polynomial", "exact"] = "polynomial"
-    """Exponential of the ``rows`` form: a polynomial of degree 6 in vectors, or the C library's, number by number."""
+    """Exponential of the ``blocks`` form: a polynomial of degree 6 in vectors, or the C library's, number by number."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ def _check(n: int, tensors: tuple[Tensor, ...], width: int, height: int, setting
         raise ValueError(f"near must be positive, got {settings.near}")
     if not settings.low_pass >= 0.0:
         raise ValueError(f"low_pass must be at least 0, got {settings.low_pass}")
-    if settings.exp not in compositing_rows.KERNELS:
-        raise ValueError(f"exp must be one of {', '.join(compositing_rows.KERNELS)}, got {settings.exp}")
+    if settings.exp not in compositing_blocks.KERNELS:
+        raise ValueError(f"exp must be one of {', '.join(compositing_blocks.KERNELS)}, got {settings.exp}")
     for name in ("alpha_threshold", "stop"):
         if not 0.0 <= getattr(settings, name) < 1.0:
             raise ValueError(f"{name} must be at least 0 and below 1, got {getattr(settings, name)}")
@@ -117,11 +117,11 @@ def _check_screen_grads(screen_grads: Tensor, means: Tensor) -> None:
 
 
 def _form(settings: RasterSettings, means: Tensor) -> Form:
-    rows_fit = means.device.type == "cpu" and means.dtype == torch.float32
-    if settings.form == "rows" and not rows_fit:
-        raise ValueError(f"form 'rows' needs float32 on a CPU, means is {means.dtype} on {means.device}")
+    blocks_fit = means.device.type == "cpu" and means.dtype == torch.float32
+    if settings.form == "blocks" and not blocks_fit:
+        raise ValueError(f"form 'blocks' needs float32 on a CPU, means is {means.dtype} on {means.device}")
     if settings.form == "auto":
-        return "rows" if rows_fit else "plain"
+        return "blocks" if blocks_fit else "plain"
     return settings.form
 
 
@@ -132,7 +132,7 @@ class Work:
     Attributes:
         splats: Footprints, columns ``projection.SPLAT``, shape [N, 16].
         lists: Intersections of each tile, by depth.
-        form: ``plain`` or ``rows``.
+        form: ``plain`` or ``blocks``.
         n_columns: Tiles across the image.
         size: Image width and height [px].
         view_ids: View of each Gaussian, shape [N], int32; empty where there is one view.
@@ -150,7 +150,7 @@ class Work:
     @property
     def n_tiles(self) -> int:
         """Return the number of tiles of all views' images."""
-        return len(self.lists.tile_begin)
+        return len(self.lists.isect_offsets) - 1
 
     @property
     def tiles_per_view(self) -> int:
@@ -160,8 +160,7 @@ class Work:
     @property
     def inputs(self) -> list[Any]:
         """List the arrays that both directions of the blending read."""
-        lists = self.lists
-        return [self.splats, lists.tile_begin, lists.tile_end, lists.isect_ids, lists.gaussian_ids]
+        return [self.splats, self.lists.isect_offsets, self.lists.gaussian_ids]
 
 
 def project(
@@ -182,7 +181,9 @@ def project(
     means = gaussians[0]
     width, height = size
     form = _form(settings, means)
-    tile = (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT) if form == "rows" else (compositing.TILE,) * 2
+    tile = (
+        (compositing_blocks.TILE_WIDTH, compositing_blocks.TILE_HEIGHT) if form == "blocks" else (compositing.TILE,) * 2
+    )
     n_columns, n_rows = -(-width // tile[0]), -(-height // tile[1])
     n = len(means)
     n_views = len(viewmat) if viewmat.ndim == 3 else 1
@@ -227,8 +228,8 @@ def blend(settings: RasterSettings, work: Work, background: Tensor) -> list[Tens
     knobs = [settings.alpha_threshold, max(settings.stop, LEAST_STOP), settings.alpha_cap]
     inputs = [*work.inputs, *_by_view(background, background), work.n_columns]
     written = _by_view(background, *outputs)
-    if work.form == "rows":
-        bridge.launch_ranges(compositing_rows.KERNELS[settings.exp][0], work.n_tiles, [*inputs, *knobs], written)
+    if work.form == "blocks":
+        bridge.launch_ranges(compositing_blocks.KERNELS[settings.exp][0], work.n_tiles, [*inputs, *knobs], written)
     else:
         inputs += [work.tiles_per_view, *knobs]
         bridge.launch(compositing.KERNELS[background.dtype][0], work.n_tiles * compositing.BLOCK, inputs, written)
@@ -248,13 +249,13 @@ def blend_backward(
         last_ids: From :func:`blend`.
         v_planes: Gradients of image, alphas and depths.
     """
-    rows = work.form == "rows"
-    # The rows write every intersection; the plain form on a CPU adds up threads that run one after the other.
-    partials = (background.new_empty if rows else background.new_zeros)(len(work.lists.isect_ids), 10)
-    inputs = [*work.inputs, *_by_view(background, background), work.n_columns]
+    blocks = work.form == "blocks"
+    # The blocks write every intersection; the plain form on a CPU adds up threads that run one after the other.
+    partials = (background.new_empty if blocks else background.new_zeros)(len(work.lists.isect_ids), 10)
+    inputs = [*work.inputs, work.lists.isect_ids, *_by_view(background, background), work.n_columns]
     rest = [settings.alpha_threshold, settings.alpha_cap, *_by_view(background, final_T, last_ids, *v_planes)]
-    if rows:
-        bridge.launch_ranges(compositing_rows.KERNELS[settings.exp][1], work.n_tiles, [*inputs, *rest], [partials])
+    if blocks:
+        bridge.launch_ranges(compositing_blocks.KERNELS[settings.exp][1], work.n_tiles, [*inputs, *rest], [partials])
     else:
         inputs += [work.tiles_per_view, *rest]
         kernel = compositing.KERNELS[background.dtype][1]

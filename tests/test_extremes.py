@@ -9,7 +9,7 @@ from extreme_mesh import cases as mesh_cases
 from extreme_raster import cases as raster_cases
 
 BUILDS = {
-    "rows float32": (torch.float32, "rows"),
+    "blocks float32": (torch.float32, "blocks"),
     "plain float32": (torch.float32, "plain"),
     "plain float64": (torch.float64, "plain"),
 }
@@ -38,8 +38,8 @@ def assert_row(
 def test_rasterizer(row, build, direction, device):
     """Each form and precision of the rasterizer that the device has."""
     dtype, form = BUILDS[build]
-    if form == "rows" and device.type != "cpu":
-        pytest.skip("the row form is the CPU's")
+    if form == "blocks" and device.type != "cpu":
+        pytest.skip("the block form is the CPU's")
     assert_row(RASTER[row], direction, dtype, device=device, form=form)
 
 

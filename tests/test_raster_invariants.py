@@ -10,14 +10,14 @@ from checks import threads
 from raster_scenes import NAMES, Scene, ball_scene, cotangent_for, decided, differentiate, render
 from torch import Tensor
 
-from mgavatar.kernels import compositing, compositing_rows
+from mgavatar.kernels import compositing, compositing_blocks
 
 
-@pytest.fixture(params=["plain", "rows"])
+@pytest.fixture(params=["plain", "blocks"])
 def form(request: pytest.FixtureRequest, device: torch.device) -> str:
     """Every form that the device has."""
-    if request.param == "rows" and device.type != "cpu":
-        pytest.skip("the row form is the CPU's")
+    if request.param == "blocks" and device.type != "cpu":
+        pytest.skip("the block form is the CPU's")
     return request.param
 
 
@@ -97,15 +97,15 @@ def test_equal_depths_keep_the_order_of_the_input(device, form):
     assert_same_bits(all_of(flat), all_of(flat))
 
 
-def test_tiles_and_rows_give_the_same_result(device):
-    """16 x 16 tiles, one thread per pixel, on any device, against the CPU's 128 x 16 tiles, eight pixels at a time."""
-    assert (compositing.TILE, compositing.TILE) != (compositing_rows.TILE_WIDTH, compositing_rows.TILE_HEIGHT)
+def test_tiles_and_blocks_give_the_same_result(device):
+    """16 x 16 tiles, one thread per pixel, on any device, against the CPU's 128 x 16 tiles in blocks of 4 x 4 pixels."""
+    assert (compositing.TILE, compositing.TILE) != (compositing_blocks.TILE_WIDTH, compositing_blocks.TILE_HEIGHT)
     scene = dense(torch.device("cpu"))
     cotangent = cotangent_for(scene) * decided(scene)
     plain = all_of(scene.to(device).knobs(form="plain"), cotangent)
-    rows = all_of(scene.knobs(form="rows"), cotangent)
-    assert ((plain[0] - rows[0]) * (cotangent != 0)).abs().max() <= 2e-6
-    for name, a, b in zip(NAMES, plain[1:], rows[1:], strict=True):
+    blocks = all_of(scene.knobs(form="blocks"), cotangent)
+    assert ((plain[0] - blocks[0]) * (cotangent != 0)).abs().max() <= 2e-6
+    for name, a, b in zip(NAMES, plain[1:], blocks[1:], strict=True):
         assert (a - b).norm() <= 5e-6 * a.norm(), name
 
 
@@ -160,7 +160,7 @@ def test_linear_in_colour_and_background(device, dtype, tolerance):
 @pytest.mark.parametrize("name", ["colors", "background"])
 def test_adjoint_of_colour_and_background(device, form, dtype, name):
     """<J v, u> = <v, J^T u>, J v being the picture of colours v alone."""
-    if form == "rows" and dtype == torch.float64:
+    if form == "blocks" and dtype == torch.float64:
         form = "plain"
     scene = dense(device, form, dtype)
     g = torch.Generator().manual_seed(2)

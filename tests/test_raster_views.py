@@ -18,15 +18,15 @@ from mgavatar.kernels.rasterize import RasterSettings, Rendering, rasterize
 BUILDS = {
     "plain float32": ("plain", torch.float32),
     "plain float64": ("plain", torch.float64),
-    "rows float32": ("rows", torch.float32),
+    "blocks float32": ("blocks", torch.float32),
 }
 
 
 @pytest.fixture(params=BUILDS)
 def build(request: pytest.FixtureRequest, device: torch.device) -> tuple[str, torch.dtype]:
     """Form and precision, every one that the device has."""
-    if BUILDS[request.param][0] == "rows" and device.type != "cpu":
-        pytest.skip("the row form is the CPU's")
+    if BUILDS[request.param][0] == "blocks" and device.type != "cpu":
+        pytest.skip("the block form is the CPU's")
     return BUILDS[request.param]
 
 
@@ -143,7 +143,7 @@ def test_any_order_of_the_gaussians(device, build):
             assert torch.equal(a, b), name
 
 
-@pytest.mark.parametrize("form", ["plain", "rows"])
+@pytest.mark.parametrize("form", ["plain", "blocks"])
 def test_any_number_of_threads_gives_the_same_bits(form):
     """Ranges of tiles and of Gaussians may cut through views."""
     views = some_views(form)

@@ -34,11 +34,11 @@ FLIPS = 1e-3
 """Largest share of pixels where rounding may change which Gaussians are blended."""
 
 
-@pytest.fixture(params=["plain", "rows"])
+@pytest.fixture(params=["plain", "blocks"])
 def form(request: pytest.FixtureRequest, device: torch.device) -> str:
     """Every form that the device has."""
-    if request.param == "rows" and device.type != "cpu":
-        pytest.skip("the row form is the CPU's")
+    if request.param == "blocks" and device.type != "cpu":
+        pytest.skip("the block form is the CPU's")
     return request.param
 
 
@@ -102,7 +102,7 @@ def test_one_gaussian_known_by_hand(device, form):
     grads = torch.autograd.grad(out.image[2, 0, 1], [*leaves, background])
     means, _, scales, opacities, colors, v_background = grads
     fall = side * (0.25 - 1.0)  # of blue, for each unit of log alpha
-    # d log(alpha) / d mean_x = 1 px / 1.3 px^2 at 5 px a metre; the variance grows by 2 * 0.2 * 25 px^2 a metre.
+    # d log(alpha) / d mean_x = 1 px / 1.3 px^2 at 5 px per metre; the variance grows by 2 * 0.2 * 25 px^2 per metre.
     assert means[0].tolist() == pytest.approx([fall * 5 / 1.3, 0.0, fall * (-1.0 / 2.6 * 2 * 1.0 / 2 / 1.3)], rel=1e-5)
     assert scales[0].tolist() == pytest.approx([fall * 10 / (2 * 1.3**2), 0.0, 0.0], rel=1e-5)
     assert opacities.tolist() == pytest.approx([fall / 0.8], rel=1e-6)
@@ -309,9 +309,9 @@ def test_bad_input_is_refused(message, device):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32])
 def test_other_precisions_are_refused(dtype, device):
-    """Only float32 and float64 have kernels; rows only float32."""
+    """Only float32 and float64 have kernels; blocks only float32."""
     scene = ball_scene(5, (8, 8)).to(device)
     with pytest.raises(ValueError, match="needs float32 or float64"):
         render(scene.to(dtype))
-    with pytest.raises(ValueError, match="form 'rows' needs float32 on a CPU"):
-        render(scene.to(torch.float64).knobs(form="rows"))
+    with pytest.raises(ValueError, match="form 'blocks' needs float32 on a CPU"):
+        render(scene.to(torch.float64).knobs(form="blocks"))

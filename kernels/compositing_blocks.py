@@ -1,8 +1,12 @@
-"""Alpha compositing on a CPU: the same mathematics as ``compositing.py``, eight pixels of a row at a time.
+"""Alpha compositing on a CPU: the mathematics of ``compositing.py`` in blocks of 4 x 4 pixels, one vector each.
 
-A work item is one tile, so threads share nothing. A Gaussian visits only the rows and pixels inside its own ellipse:
-in row form (``projection.py``) the interval of a row is one square root. Native snippets spell out the vectors, which
-the compiler maps to whatever the processor has; planes are padded by one vector, so that no row needs a tail.
+A work item is one tile, so threads share nothing. A Gaussian visits only the blocks that its ellipse reaches: in row
+form (``projection.py``) the interval of a row is one square root, and the tile's 16 rows are one vector. A band is four
+rows of the tile; the blocks of a band start at the ellipse's leftmost pixel in it, whatever that is modulo four.
+
+The planes of a tile store a band column by column, four rows at a time. A block is then 16 consecutive numbers wherever
+it starts. Each band is padded by one block, so that no block needs a tail: nothing is blended beyond the tile, because
+the transmittance there is zero.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 TILE_WIDTH = 128
-TILE_HEIGHT = 16
+TILE_HEIGHT = 16  # rows of a tile: as many as a vector has numbers
 
 _EXP2 = {
     "polynomial": """
@@ -40,11 +44,17 @@ _EXP2 = {
 }
 
 _COMMON = """
-    enum { LANES = 8, TW = %(tile_width)d, TH = %(tile_height)d, STRIDE = TW + LANES, SIZE = TH * STRIDE };
+    enum { SIDE = 4, LANES = SIDE * SIDE, TW = %(tile_width)d, TH = %(tile_height)d };
+    enum { BAND = (TW + SIDE) * SIDE, SIZE = TH / SIDE * BAND, AHEAD = 8 };
+    static_assert(TH == LANES, "the rows of a tile are one vector");
     typedef float vf __attribute__((ext_vector_type(LANES), aligned(4)));
     typedef int vi __attribute__((ext_vector_type(LANES), aligned(4)));
-    vf lane;
-    for (int i = 0; i < LANES; ++i) lane[i] = (float)i;
+    typedef float v4 __attribute__((ext_vector_type(SIDE), aligned(4)));
+    vf lane, column;
+    for (int i = 0; i < LANES; ++i) {
+        lane[i] = (float)i;
+        column[i] = (float)(i / SIDE);  // of a pixel in its block; its row is i %% SIDE
+    }
     // Written out, because what the compiler fuses by itself may differ between the two directions.
     auto fma = [](vf a, vf b, vf c) -> vf {
 #if defined(__FMA__) || defined(__ARM_FEATURE_FMA)
@@ -59,45 +69,73 @@ _COMMON = """
     auto exp2 = [fma, most](vf e) -> vf {
         EXP2
     };
+    // The numbers of four rows, repeated for each column of a block.
+    auto per_row = [](const float* rows) -> vf {
+        const v4 r = *(const v4*)rows;
+        return __builtin_shufflevector(r, r, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3);
+    };
+    // The minimum of each four rows, in all four of their lanes: exchange neighbours, then pairs.
+    auto least_of_band = [least](vf v) -> vf {
+        v = least(v, __builtin_shufflevector(v, v, 1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14));
+        return least(v, __builtin_shufflevector(v, v, 2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13));
+    };
+    auto place = [](int row, int x) -> int { return row / SIDE * BAND + x * SIDE + row %% SIDE; };
     const int per_view = n_columns * ((height + TH - 1) / TH), local = tile %% per_view;
     const int x0 = (local %% n_columns) * TW, y0 = (local / n_columns) * TH;
     const int x1 = x0 + TW < width ? x0 + TW : width, y1 = y0 + TH < height ? y0 + TH : height;
-    const int begin = tile_begin.data[tile], end = tile_end.data[tile];
+    const int begin = isect_offsets.data[tile], end = isect_offsets.data[tile + 1];
     const float threshold = alpha_threshold;
+    const int view = tile / per_view;
+    const float* back = &background.data[3 * view];
+    const float b0 = back[0], b1 = back[1], b2 = back[2];
+    const long long plane = (long long)width * height, start = view * plane;
 """ % {"tile_width": TILE_WIDTH, "tile_height": TILE_HEIGHT}
 
-# The rows of one splat inside the tile, and for each the interval of pixels where alpha can reach the threshold:
-# curvature u^2 + inv_var_y dy^2 <= reach, for LANES rows at a time. The slack only admits pixels that the test on alpha
-# then decides, and so does the tail of the last vector: beyond the tile nothing is accepted and nothing is read.
-# All of it is clamped before it becomes an integer.
-_ROWS = """
+# For each row of the tile the interval of pixels where alpha can reach the threshold:
+# curvature u^2 + inv_var_y dy^2 <= reach. A band takes the union of its rows' intervals. Pixels that it adds, and those
+# that the slack of the interval adds, are decided by the test on alpha. All bounds are clamped before they become
+# integers; a row that the ellipse does not reach has an empty interval, which moves no minimum.
+_BLOCKS = """
         const float px = s[0], py = s[1], ox = s[2], oy = s[3], curvature = s[4], shear = s[5], inv_var_y = s[6];
         const float opacity = s[7], reach = s[12], half_y = s[13], radius = s[14];
         const float steepness = -0.72134752f * curvature;  // exponents are of 2
         float top = __builtin_ceilf((py + oy) - half_y), bottom = __builtin_floorf((py + oy) + half_y);
         top = top > (float)y0 ? (top < (float)y1 ? top : (float)y1) : (float)y0;
         bottom = bottom < (float)(y1 - 1) ? (bottom > (float)(y0 - 1) ? bottom : (float)(y0 - 1)) : (float)(y1 - 1);
-        for (int strip = (int)top; strip <= (int)bottom; strip += LANES) {
-            const int n_rows = (int)bottom - strip + 1 < LANES ? (int)bottom - strip + 1 : LANES;
-            const vf dys = (lane + ((float)strip - py)) - oy;
+        if (top <= bottom) {
+            const vf ys = lane + (float)y0;
+            const vf dys = (lane + ((float)y0 - py)) - oy;
             const vf heights = inv_var_y * dys * dys;
-            const vf rooms = reach - heights;
-            const vf half_xs = fma(__builtin_elementwise_sqrt(most(rooms, (vf)0.0f)), (vf)radius, (vf)0.01f);
+            const vf half_xs = fma(__builtin_elementwise_sqrt(most(reach - heights, (vf)0.0f)), (vf)radius, (vf)0.01f);
             const vf centers = fma((vf)shear, dys, (vf)ox);
             vf lefts = __builtin_elementwise_ceil((px + centers) - half_xs);
             lefts = least(most(lefts, (vf)(float)x0), (vf)(float)x1);
-            const vf rights = least((px + centers) + half_xs, (vf)(float)(x1 - 1));
-            const vi firsts = __builtin_convertvector(lefts, vi);
-            const vi ends = __builtin_convertvector(__builtin_elementwise_floor(most(rights, lefts - 1.0f)), vi) + 1;
-            for (int j = 0; j < n_rows; ++j) {
-                const float dy = dys[j], center = centers[j], row = -0.72134752f * heights[j];
-                const int base = (strip + j - y0) * STRIDE - x0, stop_x = ends[j];
-                for (int x = firsts[j]; x < stop_x; x += LANES) {
-                    const int i = base + x;
+            const vf rights = __builtin_elementwise_floor(least((px + centers) + half_xs, (vf)(float)(x1 - 1)));
+            const vi reached = (ys >= top) & (ys <= bottom) & (rights >= lefts);
+            const vf firsts = least_of_band(reached ? lefts : (vf)(float)x1);
+            const vf stops = -least_of_band(reached ? -1.0f - rights : (vf)(float)-x0);
+            float first_of[LANES], stop_of[LANES], dy_of[LANES], center_of[LANES], row_of[LANES];
+            *(vf*)first_of = firsts;
+            *(vf*)stop_of = stops;
+            *(vf*)dy_of = dys;
+            *(vf*)center_of = centers;
+            *(vf*)row_of = -0.72134752f * heights;
+            const int last_row = ((int)bottom - y0) / SIDE * SIDE;
+            for (int row = ((int)top - y0) / SIDE * SIDE; row <= last_row; row += SIDE) {
+                const vf dy = per_row(dy_of + row), center = per_row(center_of + row), across = per_row(row_of + row);
+                const int base = row / SIDE * BAND - x0 * SIDE, stop_x = (int)stop_of[row];
+                START
+                for (int x = (int)first_of[row]; x < stop_x; x += SIDE) {
+                    const int i = base + x * SIDE;
                     if (!__builtin_reduce_or(OPEN)) continue;  // nothing is seen here any more
-                    const vf u = (lane + ((float)x - px)) - center;
-                    const vf G = exp2(fma(steepness * u, u, (vf)row));
+                    const vf u = (column + ((float)x - px)) - center;
+                    const vf G = exp2(fma(steepness * u, u, across));
                     const vf alpha = least(opacity * G, (vf)cap);
+                    BLEND
+                }
+                FINISH
+            }
+        }
 """
 
 _FORWARD = (
@@ -113,7 +151,7 @@ _FORWARD = (
         accepted[i] = -1;
     }
     for (int y = y0; y < y1; ++y)
-        for (int x = x0; x < x1; ++x) T[(y - y0) * STRIDE + x - x0] = 1.0f;
+        for (int x = x0; x < x1; ++x) T[place(y - y0, x - x0)] = 1.0f;
     for (int k = begin; k < end; ++k) {
         if (((k - begin) & 63) == 63) {
             // Once every pixel of the tile has ended, so has the tile.
@@ -121,10 +159,16 @@ _FORWARD = (
             for (int i = LANES; i < SIZE; i += LANES) open = most(open, *(const vf*)&T[i]);
             if (__builtin_reduce_max(open) < stop) break;
         }
-        const float* s = &splats.data[16LL * gaussian_ids.data[isect_ids.data[k]]];
+        // Splats lie in memory by index, not by depth: each one is a cache miss unless it is asked for early.
+        if (k + AHEAD < end) __builtin_prefetch(&splats.data[16LL * gaussian_ids.data[k + AHEAD]]);
+        const float* s = &splats.data[16LL * gaussian_ids.data[k]];
 """
-    + _ROWS.replace("OPEN", "*(const vf*)&T[i] >= stop")
-    + """
+    + _BLOCKS.replace("START", "")
+    .replace("FINISH", "")
+    .replace("OPEN", "*(const vf*)&T[i] >= stop")
+    .replace(
+        "BLEND",
+        """
                     const vf t = *(const vf*)&T[i];
                     const vi use = (alpha >= threshold) & (t >= stop);
                     const vf a = use ? alpha : (vf)0.0f;
@@ -135,19 +179,14 @@ _FORWARD = (
                     *(vf*)&depth[i] = fma(w, (vf)s[11], *(const vf*)&depth[i]);
                     *(vf*)&T[i] = t * (1.0f - a);
                     *(vi*)&accepted[i] = use ? (vi)k : *(const vi*)&accepted[i];
-                }
-            }
-        }
+""",
+    )
+    + """
     }
-    const int view = tile / (n_columns * ((height + TH - 1) / TH));
-    const float* back = &background.data[3 * view];
-    const float b0 = back[0], b1 = back[1], b2 = back[2];
-    const long long plane = (long long)width * height;
-    const long long start = view * plane;
     float* pixels = &image.data[3 * start];
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
+            const int i = place(y - y0, x - x0), o = y * width + x;
             pixels[o] = red[i] + T[i] * b0;
             pixels[plane + o] = green[i] + T[i] * b1;
             pixels[2 * plane + o] = blue[i] + T[i] * b2;
@@ -168,11 +207,6 @@ _BACKWARD = (
     + """
     float T[SIZE], v_red[SIZE], v_green[SIZE], v_blue[SIZE], v_depth[SIZE], behind[SIZE];
     int accepted[SIZE];
-    const int view = tile / (n_columns * ((height + TH - 1) / TH));
-    const float* back = &background.data[3 * view];
-    const float b0 = back[0], b1 = back[1], b2 = back[2];
-    const long long plane = (long long)width * height;
-    const long long start = view * plane;
     const float* v_pixels = &v_image.data[3 * start];
     int furthest = -1;
     for (int i = 0; i < SIZE; ++i) {
@@ -181,7 +215,7 @@ _BACKWARD = (
     }
     for (int y = y0; y < y1; ++y)
         for (int x = x0; x < x1; ++x) {
-            const int i = (y - y0) * STRIDE + x - x0, o = y * width + x;
+            const int i = place(y - y0, x - x0), o = y * width + x;
             T[i] = final_T.data[start + o];
             v_red[i] = v_pixels[o];
             v_green[i] = v_pixels[plane + o];
@@ -191,27 +225,35 @@ _BACKWARD = (
             accepted[i] = last_ids.data[start + o];
             furthest = accepted[i] > furthest ? accepted[i] : furthest;
         }
-    auto sum = [](vf v) -> float {
-        typedef float v4 __attribute__((ext_vector_type(LANES / 2)));
-        const v4 half = v.lo + v.hi;
-        return (half[0] + half[2]) + (half[1] + half[3]);
+    // Adds neighbours and puts the sums of b behind those of a. Four levels of it leave the sum of the j-th of sixteen
+    // vectors in lane j.
+    auto fold = [](vf a, vf b) -> vf {
+        return __builtin_shufflevector(a, b, 0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30) +
+               __builtin_shufflevector(a, b, 1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
     };
+    const vf zero = 0.0f;
     for (int k = end - 1; k >= begin; --k) {
-        const int isect = isect_ids.data[k];
-        float* out = &partials.data[10LL * isect];
+        float* out = &partials.data[10LL * isect_ids.data[k]];
         if (k > furthest) {  // hidden in all of the tile
             for (int c = 0; c < 10; ++c) out[c] = 0.0f;
             continue;
         }
-        const float* s = &splats.data[16LL * gaussian_ids.data[isect]];
+        if (k - AHEAD >= begin) {
+            __builtin_prefetch(&splats.data[16LL * gaussian_ids.data[k - AHEAD]]);
+            __builtin_prefetch(&partials.data[10LL * isect_ids.data[k - AHEAD]], 1);
+        }
+        const float* s = &splats.data[16LL * gaussian_ids.data[k]];
         // Moments of h = G dL/dalpha over the pixels, in u and dy; the parameters' gradients are made of them.
         vf h0 = 0.0f, hu = 0.0f, hy = 0.0f, huu = 0.0f, huy = 0.0f, hyy = 0.0f;
         vf c0 = 0.0f, c1 = 0.0f, c2 = 0.0f, c3 = 0.0f;
 """
-    + _ROWS.replace("OPEN", "*(const vi*)&accepted[i] >= k")
-    + """
+    + _BLOCKS.replace("START", "vf band_h = 0.0f, band_hu = 0.0f;")
+    .replace("OPEN", "*(const vi*)&accepted[i] >= k")
+    .replace(
+        "BLEND",
+        """
                     const vi use = (alpha >= threshold) & (*(const vi*)&accepted[i] >= k);
-                    const vf a = use ? alpha : (vf)0.0f;
+                    const vf a = use ? alpha : zero;
                     const vf rest = 1.0f - a;
                     const vf t = least(*(const vf*)&T[i] / rest, (vf)1.0f);
                     const vf w = a * t;
@@ -226,28 +268,33 @@ _BACKWARD = (
                     c2 = fma(w, g2, c2);
                     c3 = fma(w, g3, c3);
                     const vi free = use & (opacity * G <= cap);
-                    const vf h = free ? G * t * (seen - b) : (vf)0.0f;
+                    const vf h = free ? G * t * (seen - b) : zero;
                     const vf h_u = h * u;
-                    h0 += h;
-                    hu += h_u;
+                    band_h += h;
+                    band_hu += h_u;
                     huu = fma(h_u, u, huu);
-                    hy = fma(h, (vf)dy, hy);
-                    huy = fma(h_u, (vf)dy, huy);
-                    hyy = fma(h, (vf)(dy * dy), hyy);
-                }
-            }
-        }
-        const float mu = sum(hu), my = sum(hy);
-        out[0] = opacity * curvature * mu;
-        out[1] = opacity * (inv_var_y * my - curvature * shear * mu);
-        out[2] = -0.5f * opacity * sum(huu);
-        out[3] = opacity * curvature * sum(huy);
-        out[4] = -0.5f * opacity * sum(hyy);
-        out[5] = sum(h0);
-        out[6] = sum(c0);
-        out[7] = sum(c1);
-        out[8] = sum(c2);
-        out[9] = sum(c3);
+""",
+    )
+    .replace(
+        "FINISH",
+        """
+                // dy is the same in all blocks of a band, so its moments need one product per band.
+                h0 += band_h;
+                hu += band_hu;
+                hy = fma(band_h, dy, hy);
+                huy = fma(band_hu, dy, huy);
+                hyy = fma(band_h, dy * dy, hyy);
+""",
+    )
+    + """
+        const vf first = fold(fold(fold(hu, hy), fold(huu, huy)), fold(fold(hyy, h0), fold(c0, c1)));
+        const vf sums = fold(first, fold(fold(fold(c2, c3), zero), zero));
+        out[0] = opacity * curvature * sums[0];
+        out[1] = opacity * (inv_var_y * sums[1] - curvature * shear * sums[0]);
+        out[2] = -0.5f * opacity * sums[2];
+        out[3] = opacity * curvature * sums[3];
+        out[4] = -0.5f * opacity * sums[4];
+        for (int c = 5; c < 10; ++c) out[c] = sums[c];
     }
 #endif
 """
@@ -259,31 +306,29 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
 
     @wp.func_native(_FORWARD.replace("EXP2", _EXP2[exp]))
     def composite_tile(
-        tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-        isect_ids: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32], background: wp.array2d[wp.float32],
-        n_columns: int, width: int, height: int, alpha_threshold: wp.float32, stop: wp.float32, cap: wp.float32,
+        tile: int, splats: wp.array2d[wp.float32], isect_offsets: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32],
+        background: wp.array2d[wp.float32], n_columns: int, width: int, height: int, alpha_threshold: wp.float32,
+        stop: wp.float32, cap: wp.float32,
         image: wp.array4d[wp.float32], alphas: wp.array3d[wp.float32], depths: wp.array3d[wp.float32],
         final_T: wp.array3d[wp.float32], last_ids: wp.array3d[wp.int32],
     ): ...  # fmt: skip
 
     @wp.func_native(_BACKWARD.replace("EXP2", _EXP2[exp]))
     def composite_tile_bwd(
-        tile: int, splats: wp.array2d[wp.float32], tile_begin: wp.array[wp.int32], tile_end: wp.array[wp.int32],
-        isect_ids: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32], background: wp.array2d[wp.float32],
-        n_columns: int, width: int, height: int, alpha_threshold: wp.float32, cap: wp.float32,
+        tile: int, splats: wp.array2d[wp.float32], isect_offsets: wp.array[wp.int32], gaussian_ids: wp.array[wp.int32],
+        isect_ids: wp.array[wp.int32], background: wp.array2d[wp.float32], n_columns: int, width: int, height: int,
+        alpha_threshold: wp.float32, cap: wp.float32,
         final_T: wp.array3d[wp.float32], last_ids: wp.array3d[wp.int32], v_image: wp.array4d[wp.float32],
         v_alphas: wp.array3d[wp.float32], v_depths: wp.array3d[wp.float32], partials: wp.array2d[wp.float32],
     ): ...  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
-    def composite_rows_kernel(
+    def composite_blocks_kernel(
         # In:
         first: int,
         splats: wp.array2d[wp.float32],  # [N, 16] projection.SPLAT
-        tile_begin: wp.array[wp.int32],  # [T]
-        tile_end: wp.array[wp.int32],  # [T]
-        isect_ids: wp.array[wp.int32],  # [M]
-        gaussian_ids: wp.array[wp.int32],  # [M]
+        isect_offsets: wp.array[wp.int32],  # [T + 1] first entry of each tile in the lists
+        gaussian_ids: wp.array[wp.int32],  # [M] by tile, front to back
         background: wp.array2d[wp.float32],  # [B, 3]
         n_columns: int,
         alpha_threshold: wp.float32,
@@ -294,22 +339,21 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
         alphas: wp.array3d[wp.float32],  # [B, H, W]
         depths: wp.array3d[wp.float32],  # [B, H, W] sum of weight times depth
         final_T: wp.array3d[wp.float32],  # [B, H, W]
-        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of isect_ids blended last, -1 if none
+        last_ids: wp.array3d[wp.int32],  # [B, H, W] entry of the lists blended last, -1 if none
     ):
         composite_tile(
-            first + wp.tid(), splats, tile_begin, tile_end, isect_ids, gaussian_ids, background, n_columns,
+            first + wp.tid(), splats, isect_offsets, gaussian_ids, background, n_columns,
             image.shape[3], image.shape[2], alpha_threshold, stop, cap, image, alphas, depths, final_T, last_ids,
         )  # fmt: skip
 
     @wp.kernel(module=module, enable_backward=False)
-    def composite_rows_bwd_kernel(
+    def composite_blocks_bwd_kernel(
         # In:
         first: int,
         splats: wp.array2d[wp.float32],  # [N, 16]
-        tile_begin: wp.array[wp.int32],  # [T]
-        tile_end: wp.array[wp.int32],  # [T]
-        isect_ids: wp.array[wp.int32],  # [M]
-        gaussian_ids: wp.array[wp.int32],  # [M]
+        isect_offsets: wp.array[wp.int32],  # [T + 1]
+        gaussian_ids: wp.array[wp.int32],  # [M] by tile, front to back
+        isect_ids: wp.array[wp.int32],  # [M] row of partials of each entry
         background: wp.array2d[wp.float32],  # [B, 3]
         n_columns: int,
         alpha_threshold: wp.float32,
@@ -323,12 +367,12 @@ def _kernels(exp: str) -> tuple[wp.Kernel, wp.Kernel]:
         partials: wp.array2d[wp.float32],  # [M, 10]
     ):
         composite_tile_bwd(
-            first + wp.tid(), splats, tile_begin, tile_end, isect_ids, gaussian_ids, background, n_columns,
+            first + wp.tid(), splats, isect_offsets, gaussian_ids, isect_ids, background, n_columns,
             v_image.shape[3], v_image.shape[2], alpha_threshold, cap, final_T, last_ids, v_image, v_alphas, v_depths,
             partials,
         )  # fmt: skip
 
-    return composite_rows_kernel, composite_rows_bwd_kernel
+    return composite_blocks_kernel, composite_blocks_bwd_kernel
 
 
 KERNELS = {exp: _kernels(exp) for exp in _EXP2}
