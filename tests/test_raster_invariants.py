@@ -98,7 +98,7 @@ def test_equal_depths_keep_the_order_of_the_input(device, form):
 
 
 def test_tiles_and_blocks_give_the_same_result(device):
-    """16 x 16 tiles, one thread per pixel, on any device, against the CPU's 128 x 16 tiles in blocks of 4 x 4 pixels."""
+    """16 x 16 tiles, one thread per pixel, on any device, against the CPU's 128 x 16 tiles of 4 x 4 pixel blocks."""
     assert (compositing.TILE, compositing.TILE) != (compositing_blocks.TILE_WIDTH, compositing_blocks.TILE_HEIGHT)
     scene = dense(torch.device("cpu"))
     cotangent = cotangent_for(scene) * decided(scene)
