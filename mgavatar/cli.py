@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import io
 import json
 import logging
 import os
@@ -478,6 +479,10 @@ def main() -> None:
     # Threads that wait without spinning: on a busy machine spinning makes small parallel loops many times slower.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    # Many code pages of Windows lack the help's bullets and letters of people's paths: a question mark will do.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(logging.Formatter("mgavatar: %(message)s"))
     logger = logging.getLogger("mgavatar")

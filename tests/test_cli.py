@@ -282,6 +282,15 @@ def test_help_imports_neither_torch_nor_warp():
         assert word in done.stdout
 
 
+def test_output_that_a_code_page_lacks_letters_for():
+    """Help and paths come through on a console or into a file that cannot show all of Unicode, as on Windows."""
+    for argv, code in ((["--help"], 0), (["fit", "--data", "тест•"], 1)):
+        command = [sys.executable, "-c", "from mgavatar.cli import main; main()", *argv]
+        done = subprocess.run(command, capture_output=True, env={**CHILD_ENV, "PYTHONIOENCODING": "cp850"})
+        assert done.returncode == code, done.stderr.decode("cp850")
+        assert b"?" in done.stdout + done.stderr
+
+
 def test_a_process_of_its_own_says_one_line_too(work):
     """Nothing else on stderr: no banner of Warp's, no warning, no traceback."""
     truncated_png(work)
