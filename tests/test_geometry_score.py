@@ -64,6 +64,29 @@ def test_geometry_of_a_known_offset(pair: tuple[Avatar, Subject], tmp_path: Path
     assert turned["normal_deg"] == pytest.approx(180.0 - score["normal_deg"], abs=0.01)
 
 
+def test_scores_are_those_of_trimesh(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
+    """Distances and angles of a crumpled truth agree with an independent search in double precision."""
+    avatar, subject = pair
+    faces = avatar.head.body.faces.numpy()
+    rng = np.random.default_rng(1)
+    fitted = [avatar.verts(avatar.head.pose(t)).numpy() for t in range(len(subject.params))]
+    true = [verts + rng.normal(0.0, 0.01, verts.shape).astype(np.float32) for verts in fitted]
+    score = _score(avatar, _with_truth(avatar, subject, tmp_path / "truth.npz", vertices=np.stack(true)))
+    distances, angles = [], []
+    for verts, points in zip(fitted[:3], true[:3], strict=True):
+        mesh, surface = (trimesh.Trimesh(values, faces, process=False) for values in (verts, points))
+        _, distance, face_ids = trimesh.proximity.closest_point_naive(mesh, points)
+        normals = np.zeros_like(points, np.float64)
+        np.add.at(normals, faces, surface.face_normals[:, None] * surface.area_faces[:, None, None])
+        cosine = (mesh.face_normals[face_ids] * normals).sum(1) / np.linalg.norm(normals, axis=1)
+        distances.append(1e3 * distance)
+        angles.append(np.degrees(np.arccos(cosine)))
+    assert score["mean_mm"] == pytest.approx(np.mean(distances), rel=1e-4)
+    assert score["median_mm"] == pytest.approx(np.median(distances), rel=1e-4)
+    assert score["p95_mm"] == pytest.approx(np.percentile(distances, 95), rel=1e-4)
+    assert score["normal_deg"] == pytest.approx(np.mean(angles), abs=0.5)
+
+
 def test_regions_that_are_seen(pair: tuple[Avatar, Subject], tmp_path: Path) -> None:
     """The face is what counts, where three images see it; every mask has its own figures, and so have unions."""
     avatar, subject = pair
