@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mgavatar.driving.motion import Driving
-from mgavatar.driving.readers import flame_codes, vhap
+from mgavatar.driving.readers import audio2face, flame_codes, lam, live_link, mediapipe, vhap
 from mgavatar.errors import DataError
 from mgavatar.files import existing_file, npz_names, one_line, read_npz
 
@@ -26,7 +26,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: tuple[Reader, ...] = (flame_codes, vhap)
+READERS: tuple[Reader, ...] = (flame_codes, vhap, live_link, audio2face, lam, mediapipe)
 """All formats, in the order in which they are tried: those whose marks are more particular come first."""
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -73,4 +75,169 @@ def write_diffposetalk(path: Path, made: Performance) -> Path:
     """DiffPoseTalk's coefficients: 50 expressions, a pose of root and jaw, one identity."""
     pose = np.concatenate([made.root, made.jaw], axis=-1)
     np.savez(path, exp=made.expr[:, :50].astype(np.float32), pose=pose.astype(np.float32), shape=np.zeros(100))
+    return path
+
+
+ARKIT_ORDER = """
+    EyeBlinkLeft EyeLookDownLeft EyeLookInLeft EyeLookOutLeft EyeLookUpLeft EyeSquintLeft EyeWideLeft EyeBlinkRight
+    EyeLookDownRight EyeLookInRight EyeLookOutRight EyeLookUpRight EyeSquintRight EyeWideRight JawForward JawRight
+    JawLeft JawOpen MouthClose MouthFunnel MouthPucker MouthRight MouthLeft MouthSmileLeft MouthSmileRight
+    MouthFrownLeft MouthFrownRight MouthDimpleLeft MouthDimpleRight MouthStretchLeft MouthStretchRight MouthRollLower
+    MouthRollUpper MouthShrugLower MouthShrugUpper MouthPressLeft MouthPressRight MouthLowerDownLeft
+    MouthLowerDownRight MouthUpperUpLeft MouthUpperUpRight BrowDownLeft BrowDownRight BrowInnerUp BrowOuterUpLeft
+    BrowOuterUpRight CheekPuff CheekSquintLeft CheekSquintRight NoseSneerLeft NoseSneerRight TongueOut
+""".split()
+"""The blendshapes as the phone's app writes them."""
+
+
+def camel(name: str) -> str:
+    """ARKit's own spelling of a name of the app."""
+    return name[0].lower() + name[1:]
+
+
+@dataclass(frozen=True)
+class Face:
+    """Weights by ARKit's own names, shape [T] each, and the turns of head and eyes in degrees: to the subject's left,
+    downwards, and with the left ear up.
+    """
+
+    weights: dict[str, np.ndarray]
+    head: np.ndarray
+    left_eye: np.ndarray
+    right_eye: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.head)
+
+
+def face(n_frames: int = 12, *, seed: int = 2) -> Face:
+    """A face of smooth weights; the head turns by up to 30 degrees."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0.0, 2.0, n_frames)[:, None]
+    waves = 0.5 + 0.5 * np.sin(time * rng.uniform(0.5, 3.0, 52) + rng.uniform(0.0, 6.0, 52))
+    turns = [np.sin(time + rng.uniform(0.0, 6.0, 3)) * [limit, limit / 2, limit / 3] for limit in (30.0, 12.0, 12.0)]
+    return Face({camel(name): wave for name, wave in zip(ARKIT_ORDER, waves.T, strict=True)}, *turns)
+
+
+def timecode(frame: float, rate: int, start: str = "10:21:33") -> str:
+    """The app's time code of a frame after a start of whole seconds; days have 24 hours."""
+    hours, minutes, seconds = map(int, start.split(":"))
+    total = (hours * 60 + minutes) * 60 + seconds
+    whole, part = divmod(frame, rate)
+    total = (total + int(whole)) % 86400
+    return f"{total // 3600:02d}:{total // 60 % 60:02d}:{total % 60:02d}:{int(part):02d}.{int(part % 1 * 1000):03d}"
+
+
+def write_live_link(
+    path: Path,
+    made: Face,
+    *,
+    rate: int = 60,
+    start: str = "10:21:33",
+    frames: list[float] | None = None,
+    count: str = "BlendShapeCount",
+    order: list[str] | None = None,
+    degrees: bool = False,
+    angles: bool = True,
+    lost: tuple[int, ...] = (),
+) -> Path:
+    """A take of the Live Link Face app: weights with eight digits, angles in radians or degrees."""
+    names = order or ARKIT_ORDER
+    parts = ("Head", "LeftEye", "RightEye")
+    turns = [f"{part}{angle}" for part in parts for angle in ("Yaw", "Pitch", "Roll")] if angles else []
+    lines = [",".join(["Timecode", count, *names, *turns])]
+    unit = 1.0 if degrees else np.pi / 180.0
+    for t in range(len(made)):
+        code = timecode(frames[t] if frames else t, rate, start)
+        if t in lost:
+            lines.append(f"{code},0")
+            continue
+        values = [made.weights[camel(name)][t] for name in names]
+        if angles:
+            values += [unit * angle for part in (made.head, made.left_eye, made.right_eye) for angle in part[t]]
+        lines.append(",".join([code, "61", *(f"{value:.8f}" for value in values)]))
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode())
+    return path
+
+
+def write_lam(path: Path, made: Face, *, fps: float = 30.0, times: bool = True) -> Path:
+    """LAM's and LAM_Audio2Expression's JSON."""
+    names = sorted(made.weights)
+    frames = []
+    for t in range(len(made)):
+        frame = {"weights": [float(made.weights[name][t]) for name in names], "rotation": []}
+        frames.append({**frame, "time": t / fps} if times else frame)
+    metadata = {"fps": fps, "frame_count": len(made), "blendshape_names": names}
+    path.write_text(json.dumps({"names": names, "metadata": metadata, "frames": frames}))
+    return path
+
+
+def write_audio2face_csv(path: Path, made: Face, *, fps: float = 30.0) -> Path:
+    """``animation_frames.csv`` of Audio2Face-3D: a first column without a name, times in seconds."""
+    names = ARKIT_ORDER[:-1]
+    lines = [",".join(["", "timeCode", *(f"blendShapes.{name}" for name in names)])]
+    for t in range(len(made)):
+        lines.append(",".join([str(t), f"{t / fps:.6f}", *(f"{made.weights[camel(name)][t]:.7f}" for name in names)]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_audio2face_output(path: Path, made: Face, *, fps: float = 60.0) -> Path:
+    """``output_blendshape.csv`` of Audio2Face-3D's samples: ``timecode`` in seconds and plain names."""
+    lines = [",".join(["timecode", *ARKIT_ORDER])]
+    for t in range(len(made)):
+        lines.append(",".join([f"{t / fps:.4f}", *(f"{made.weights[camel(name)][t]:.7f}" for name in ARKIT_ORDER)]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_audio2face_json(path: Path, made: Face, *, fps: float = 30.0) -> Path:
+    """Omniverse's JSON of blendshape weights."""
+    names = [camel(name) for name in ARKIT_ORDER]
+    matrix = [[float(made.weights[name][t]) for name in names] for t in range(len(made))]
+    content = {"exportFps": fps, "trackPath": "a.wav", "numPoses": 52, "numFrames": len(made)}
+    path.write_text(json.dumps({**content, "facsNames": names, "weightMat": matrix}))
+    return path
+
+
+def turn_matrix(degrees: np.ndarray) -> np.ndarray:
+    """The rotation by yaw, pitch and roll of a ``Face``, written out, x to the subject's left, y up, z forward."""
+    (sy, sp, sr), (cy, cp, cr) = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
+    yaw = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])  # forward goes to the left
+    pitch = np.array([[1.0, 0.0, 0.0], [0.0, cp, -sp], [0.0, sp, cp]])  # forward goes down
+    roll = np.array([[cr, -sr, 0.0], [sr, cr, 0.0], [0.0, 0.0, 1.0]])  # the left goes up
+    return yaw @ pitch @ roll
+
+
+def write_mediapipe(
+    path: Path,
+    made: Face,
+    *,
+    style: Literal["categories", "python", "javascript", "lines"] = "python",
+    matrices: bool = True,
+    fps: float = 30.0,
+    lost: tuple[int, ...] = (),
+) -> Path:
+    """Results of FaceLandmarker: ``_neutral`` first, no ``tongueOut``, in the ways that programs dump them."""
+    frames = []
+    for t in range(len(made)):
+        scores = [("_neutral", 1e-6), *((name, float(made.weights[name][t])) for name in sorted(made.weights))][:-1]
+        key = "categoryName" if style == "javascript" else "category_name"
+        faces = [[{"index": i, "score": s, key: name, "display_name": ""} for i, (name, s) in enumerate(scores)]]
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn_matrix(made.head[t]), (1.5, -2.0, -45.0)
+        stamp = round(1000.0 * t / fps)
+        if t in lost:
+            faces = []
+        if style == "categories":
+            frames.append(faces[0] if faces else [])
+        elif style == "javascript":
+            entry = {"faceBlendshapes": [{"categories": face, "headIndex": -1, "headName": ""} for face in faces]}
+            data = {"rows": 4, "columns": 4, "data": matrix.T.ravel().tolist()}  # column after column
+            frames.append({**entry, "facialTransformationMatrixes": [data] if faces else [], "timestampMs": stamp})
+        else:
+            frames.append({"timestamp_ms": stamp, "face_blendshapes": faces})
+            if matrices:
+                frames[-1]["facial_transformation_matrixes"] = [matrix.tolist()] if faces else []
+    path.write_text("\n".join(map(json.dumps, frames)) + "\n" if style == "lines" else json.dumps(frames))
     return path

@@ -1,0 +1,183 @@
+"""MediaPipe's FaceLandmarker: its results, frame by frame, as programs dump them to JSON.
+
+There is no format of its own. A frame is a list of categories (``category_name``, ``score``), or an object that holds
+one beside the time and ``facial_transformation_matrixes``; the names of the Python and of the JavaScript interface
+are both read. A file is one JSON value, or one per line. The matrix takes MediaPipe's canonical face, whose axes are
+FLAME's, to the axes of a camera that looks along -z, so that its rotation is that of the head against the camera.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mgavatar.driving.arkit import FEWEST_NAMES, Weights, arkit_motion, arkit_name, n_arkit_names
+from mgavatar.driving.motion import Driving, frame_rate
+from mgavatar.driving.tables import MAX_TABLE_BYTES, json_content, json_numbers, opening
+from mgavatar.errors import DataError
+from mgavatar.files import one_line, read_bytes
+
+UNDERSTOOD = "MediaPipe FaceLandmarker JSON"
+
+NEUTRAL = "_neutral"
+"""MediaPipe's first category, which is no blendshape."""
+
+FRAMES = ("frames", "results", "data")
+
+BLENDSHAPES = ("face_blendshapes", "faceBlendshapes", "blendshapes", "categories", "blendshape_scores")
+
+MATRICES = (
+    "facial_transformation_matrixes",
+    "facialTransformationMatrixes",
+    "facial_transformation_matrix",
+    "transformation_matrix",
+    "matrix",
+)
+
+NAMES = ("category_name", "categoryName", "name")
+
+TIMES = {"timestamp_ms": 1e-3, "timestampMs": 1e-3, "timestamp_us": 1e-6, "time": 1.0, "time_s": 1.0, "timestamp": None}
+"""Keys of a frame's time and their units [s]; a bare ``timestamp`` is one of them, by its steps."""
+
+
+def recognises(path: Path) -> bool:
+    """Return True for JSON in which a frame has scores of ARKit's names."""
+    frames = _frames(_content(path, limit=MAX_TABLE_BYTES))
+    return any(n_arkit_names(list(_scores(frame) or {})) >= FEWEST_NAMES for frame in frames)
+
+
+def read(path: Path) -> Driving:
+    """Read such a file; the errors are those of ``read_driving``."""
+    content = _content(path, limit=MAX_TABLE_BYTES)
+    frames = _frames(content)
+    scores = [_scores(frame) or {} for frame in frames]
+    names = sorted({name for frame in scores for name in frame if name != NEUTRAL})
+    values = np.full((len(frames), len(names)), np.nan)
+    for index, frame in enumerate(scores):
+        if frame:
+            given = [frame.get(name, 0.0) for name in names]
+            values[index] = json_numbers(given, where=f"{path}: frame {index}: scores")
+    rate = content.get("fps") if isinstance(content, dict) else None
+    weights = Weights(
+        names,
+        values,
+        times=_times(frames),
+        fps=None if rate is None else frame_rate(json_numbers([rate], where=f"{path}: fps"), path=path),
+        head=_head(frames, ~np.isnan(values).all(axis=1), path=path),
+    )
+    return arkit_motion(weights, path=path)
+
+
+def _content(path: Path, *, limit: int) -> Any:
+    """Return the JSON value, or the list of the values of all lines; None if the file is neither."""
+    content = json_content(path)
+    start = opening(path, n_bytes=64).lstrip()
+    if content is not None or start[:1] not in (b"{", b"["):
+        return content
+    try:
+        lines = read_bytes(path, max_bytes=limit).splitlines()
+        return [json.loads(line) for line in lines if line.strip()]
+    except (ValueError, RecursionError, DataError):
+        return None
+
+
+def _frames(content: Any) -> list[Any]:
+    """Return the list of frames, or none if there is nothing like one."""
+    if isinstance(content, dict):
+        for key in FRAMES:
+            if isinstance(content.get(key), list):
+                return content[key]
+        return [content] if any(key in content for key in BLENDSHAPES) else []
+    if not isinstance(content, list):
+        return []
+    return [content] if dict(_categories(content)) else content  # the result of a single image
+
+
+def _scores(value: Any) -> dict[str, Any] | None:
+    """Return the scores by name of the first face in a frame, or None if it has none."""
+    for _ in range(5):  # results hold lists of faces, which hold categories, in more than one way
+        if isinstance(value, dict):
+            inner = next((value[key] for key in BLENDSHAPES if key in value), None)
+            if inner is None:
+                return {name: score for name, score in value.items() if arkit_name(name) is not None} or None
+            value = inner
+        elif isinstance(value, list) and value:
+            named = dict(_categories(value))
+            if named:
+                return named
+            value = value[0]
+        else:
+            return None
+    return None
+
+
+def _categories(value: list[Any]) -> Iterator[tuple[str, Any]]:
+    for entry in value:
+        if isinstance(entry, dict) and "score" in entry:
+            name = next((entry[key] for key in NAMES if isinstance(entry.get(key), str)), None)
+            if name is not None:
+                yield name, entry["score"]
+
+
+def _times(frames: list[Any]) -> np.ndarray | None:
+    """Return the time of each frame [s], or None if not all frames have one."""
+    for key, unit in TIMES.items():
+        given = [frame.get(key) if isinstance(frame, dict) else None for frame in frames]
+        if given and all(isinstance(time, int | float) and not isinstance(time, bool) for time in given):
+            try:
+                times = np.array(given, np.float64)
+            except OverflowError:
+                return None
+            return times * (unit or _unit(times))
+    return None
+
+
+def _unit(times: np.ndarray) -> float:
+    """Return the unit of bare time stamps [s]: steps of a video are 0.008 to 0.2 s, so units lie far apart."""
+    step = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+    return 1.0 if step < 1.0 else 1e-3 if step < 1000.0 else 1e-6
+
+
+def _head(frames: list[Any], found: np.ndarray, *, path: Path) -> np.ndarray | None:
+    """Return rotation vectors of the head [rad], shape [T, 3]; None if not all frames with a face have a matrix."""
+    given = [_matrix_entry(frame) for frame in frames]
+    if not any(entry is not None for entry in given):
+        return None
+    out = np.full((len(frames), 3), np.nan)
+    for index, entry in enumerate(given):
+        if not found[index]:
+            continue
+        matrix = _matrix(entry, where=f"{path}: frame {index}: facial transformation matrix")
+        out[index] = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+    return out
+
+
+def _matrix_entry(frame: Any) -> Any:
+    if not isinstance(frame, dict):
+        return None
+    entry = next((frame[key] for key in MATRICES if frame.get(key) is not None), None)
+    return None if isinstance(entry, list) and not entry else entry
+
+
+def _matrix(entry: Any, *, where: str) -> np.ndarray:
+    """Return a 4x4 matrix from rows, from a list of matrices, or from JavaScript's ``data``, column after column."""
+    if isinstance(entry, list) and len(entry) == 1:
+        entry = entry[0]
+    numbers = entry.get("data") if isinstance(entry, dict) else entry
+    if isinstance(numbers, list) and len(numbers) == 4 and all(isinstance(row, list) for row in numbers):
+        numbers = [number for row in numbers for number in row]
+    if not isinstance(numbers, list) or len(numbers) != 16:
+        raise DataError(f"{where} is {one_line(repr(entry), limit=40)}, 4x4 numbers are needed")
+    matrix = json_numbers(numbers, where=where).reshape(4, 4)
+    if np.allclose(matrix[:3, 3], 0.0) and not np.allclose(matrix[3, :3], 0.0):
+        matrix = matrix.T  # the place of the head belongs into the last column
+    rotation = matrix[:3, :3]
+    bounded = np.isfinite(matrix).all() and np.abs(rotation).max() < 1e3
+    if not bounded or np.linalg.det(rotation) < 1e-6:
+        raise DataError(f"{where} is no rotation and translation")
+    return matrix
