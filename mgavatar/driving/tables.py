@@ -141,9 +141,9 @@ def json_numbers(values: list[Any], *, where: str) -> np.ndarray:
     Raises:
         DataError: If one of them is something else; text and true are no numbers.
     """
-    for value in values:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise DataError(f"{where}: {one_line(repr(value), limit=40)} is not a number")
+    if not {*map(type, values)} <= {int, float}:
+        wrong = next(value for value in values if type(value) not in (int, float))
+        raise DataError(f"{where}: {one_line(repr(wrong), limit=40)} is not a number")
     try:
         return np.array(values, np.float64)
     except OverflowError as error:

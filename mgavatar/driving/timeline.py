@@ -73,8 +73,8 @@ def at_regular_times(track: Track, *, fps: float | None, path: Path) -> Track:
     n_regular = round(float(places[-1])) + 1
     if n_regular > min(MAX_FRAMES, 4 * n_frames + 3600):
         raise DataError(
-            f"{path}: {n_frames} frames span {times[keep][-1]:.6g} s at {rate:g} per second; cut the recording where it "
-            "pauses"
+            f"{path}: {n_frames} frames span {times[keep][-1]:.6g} s at {rate:g} per second; cut the recording "
+            "where it pauses"
         )
     regular = n_regular == len(places) and np.abs(places - np.arange(n_regular)).max() < REGULAR
     if not regular:

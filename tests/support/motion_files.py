@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -79,14 +80,15 @@ def write_diffposetalk(path: Path, made: Performance) -> Path:
 
 
 ARKIT_ORDER = """
-    EyeBlinkLeft EyeLookDownLeft EyeLookInLeft EyeLookOutLeft EyeLookUpLeft EyeSquintLeft EyeWideLeft EyeBlinkRight
-    EyeLookDownRight EyeLookInRight EyeLookOutRight EyeLookUpRight EyeSquintRight EyeWideRight JawForward JawRight
-    JawLeft JawOpen MouthClose MouthFunnel MouthPucker MouthRight MouthLeft MouthSmileLeft MouthSmileRight
-    MouthFrownLeft MouthFrownRight MouthDimpleLeft MouthDimpleRight MouthStretchLeft MouthStretchRight MouthRollLower
-    MouthRollUpper MouthShrugLower MouthShrugUpper MouthPressLeft MouthPressRight MouthLowerDownLeft
-    MouthLowerDownRight MouthUpperUpLeft MouthUpperUpRight BrowDownLeft BrowDownRight BrowInnerUp BrowOuterUpLeft
-    BrowOuterUpRight CheekPuff CheekSquintLeft CheekSquintRight NoseSneerLeft NoseSneerRight TongueOut
-""".split()
+    EyeBlinkLeft EyeLookDownLeft EyeLookInLeft EyeLookOutLeft EyeLookUpLeft EyeSquintLeft EyeWideLeft
+    EyeBlinkRight EyeLookDownRight EyeLookInRight EyeLookOutRight EyeLookUpRight EyeSquintRight EyeWideRight
+    JawForward JawRight JawLeft JawOpen MouthClose MouthFunnel MouthPucker MouthRight MouthLeft MouthSmileLeft
+    MouthSmileRight MouthFrownLeft MouthFrownRight MouthDimpleLeft MouthDimpleRight MouthStretchLeft
+    MouthStretchRight MouthRollLower MouthRollUpper MouthShrugLower MouthShrugUpper MouthPressLeft
+    MouthPressRight MouthLowerDownLeft MouthLowerDownRight MouthUpperUpLeft MouthUpperUpRight BrowDownLeft
+    BrowDownRight BrowInnerUp BrowOuterUpLeft BrowOuterUpRight CheekPuff CheekSquintLeft CheekSquintRight
+    NoseSneerLeft NoseSneerRight TongueOut
+""".split()  # noqa: SIM905  shorter to read than a list
 """The blendshapes as the phone's app writes them."""
 
 
@@ -175,19 +177,18 @@ def write_lam(path: Path, made: Face, *, fps: float = 30.0, times: bool = True) 
 def write_audio2face_csv(path: Path, made: Face, *, fps: float = 30.0) -> Path:
     """``animation_frames.csv`` of Audio2Face-3D: a first column without a name, times in seconds."""
     names = ARKIT_ORDER[:-1]
-    lines = [",".join(["", "timeCode", *(f"blendShapes.{name}" for name in names)])]
-    for t in range(len(made)):
-        lines.append(",".join([str(t), f"{t / fps:.6f}", *(f"{made.weights[camel(name)][t]:.7f}" for name in names)]))
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    header = ["", "timeCode", *(f"blendShapes.{name}" for name in names)]
+    return _write_rows(path, header, made, names, lambda t: [str(t), f"{t / fps:.6f}"])
 
 
 def write_audio2face_output(path: Path, made: Face, *, fps: float = 60.0) -> Path:
     """``output_blendshape.csv`` of Audio2Face-3D's samples: ``timecode`` in seconds and plain names."""
-    lines = [",".join(["timecode", *ARKIT_ORDER])]
-    for t in range(len(made)):
-        lines.append(",".join([f"{t / fps:.4f}", *(f"{made.weights[camel(name)][t]:.7f}" for name in ARKIT_ORDER)]))
-    path.write_text("\n".join(lines) + "\n")
+    return _write_rows(path, ["timecode", *ARKIT_ORDER], made, ARKIT_ORDER, lambda t: [f"{t / fps:.4f}"])
+
+
+def _write_rows(path: Path, header: list[str], made: Face, names: list[str], first: Callable[[int], list[str]]) -> Path:
+    rows = [[*first(t), *(f"{made.weights[camel(name)][t]:.7f}" for name in names)] for t in range(len(made))]
+    path.write_text("".join(",".join(row) + "\n" for row in [header, *rows]))
     return path
 
 

@@ -107,7 +107,7 @@ def _timecode_rate(frames: np.ndarray, *, path: Path) -> tuple[int, list[str]]:
 
 
 def _rotations(table: Table) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return rotation vectors [rad] of head and eyes where the table has their angles, and the unit that was assumed."""
+    """Return rotation vectors [rad] of head and eyes where the table has their angles, and the unit assumed."""
     found = {}
     for part in ("head", "lefteye", "righteye"):
         columns = [_column(table, part + angle) for angle in ANGLES]

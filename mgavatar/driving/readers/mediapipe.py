@@ -9,7 +9,6 @@ FLAME's, to the axes of a camera that looks along -z, so that its rotation is th
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +94,7 @@ def _frames(content: Any) -> list[Any]:
         return [content] if any(key in content for key in BLENDSHAPES) else []
     if not isinstance(content, list):
         return []
-    return [content] if dict(_categories(content)) else content  # the result of a single image
+    return [content] if _categories(content) else content  # the result of a single image
 
 
 def _scores(value: Any) -> dict[str, Any] | None:
@@ -107,7 +106,7 @@ def _scores(value: Any) -> dict[str, Any] | None:
                 return {name: score for name, score in value.items() if arkit_name(name) is not None} or None
             value = inner
         elif isinstance(value, list) and value:
-            named = dict(_categories(value))
+            named = _categories(value)
             if named:
                 return named
             value = value[0]
@@ -116,12 +115,17 @@ def _scores(value: Any) -> dict[str, Any] | None:
     return None
 
 
-def _categories(value: list[Any]) -> Iterator[tuple[str, Any]]:
-    for entry in value:
-        if isinstance(entry, dict) and "score" in entry:
-            name = next((entry[key] for key in NAMES if isinstance(entry.get(key), str)), None)
-            if name is not None:
-                yield name, entry["score"]
+def _categories(value: list[Any]) -> dict[str, Any]:
+    """Return the scores of a list of categories by their names; none if it is something else."""
+    first = value[0] if value and isinstance(value[0], dict) else {}
+    key = next((key for key in NAMES if isinstance(first.get(key), str)), None)
+    if key is None or "score" not in first:
+        return {}
+    return {
+        entry[key]: entry["score"]
+        for entry in value
+        if isinstance(entry, dict) and isinstance(entry.get(key), str) and "score" in entry
+    }
 
 
 def _times(frames: list[Any]) -> np.ndarray | None:
@@ -144,16 +148,25 @@ def _unit(times: np.ndarray) -> float:
 
 
 def _head(frames: list[Any], found: np.ndarray, *, path: Path) -> np.ndarray | None:
-    """Return rotation vectors of the head [rad], shape [T, 3]; None if not all frames with a face have a matrix."""
+    """Return rotation vectors of the head [rad], shape [T, 3], or None if no frame has a matrix."""
     given = [_matrix_entry(frame) for frame in frames]
     if not any(entry is not None for entry in given):
         return None
+    known = np.flatnonzero(found)
+    where = [f"{path}: frame {index}: facial transformation matrix" for index in known]
+    numbers = [_sixteen(given[index], where=place) for index, place in zip(known, where, strict=True)]
+    matrices = np.array(numbers, np.float64).reshape(-1, 4, 4)
+    # The place of the head belongs into the last column: matrices that have it in the last row are column after column.
+    flipped = (np.abs(matrices[:, :3, 3]) < 1e-8).all(axis=1) & (np.abs(matrices[:, 3, :3]) > 1e-8).any(axis=1)
+    matrices[flipped] = matrices[flipped].transpose(0, 2, 1)
+    turns = matrices[:, :3, :3]
+    bounded = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(turns).max(axis=(1, 2)) < 1e3)
+    turns = np.where(bounded[:, None, None], turns, 0.0)
+    wrong = np.linalg.det(turns) < 1e-6
+    if wrong.any():
+        raise DataError(f"{where[int(np.argmax(wrong))]} is no rotation and translation")
     out = np.full((len(frames), 3), np.nan)
-    for index, entry in enumerate(given):
-        if not found[index]:
-            continue
-        matrix = _matrix(entry, where=f"{path}: frame {index}: facial transformation matrix")
-        out[index] = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
+    out[known] = Rotation.from_matrix(turns).as_rotvec()
     return out
 
 
@@ -164,8 +177,8 @@ def _matrix_entry(frame: Any) -> Any:
     return None if isinstance(entry, list) and not entry else entry
 
 
-def _matrix(entry: Any, *, where: str) -> np.ndarray:
-    """Return a 4x4 matrix from rows, from a list of matrices, or from JavaScript's ``data``, column after column."""
+def _sixteen(entry: Any, *, where: str) -> np.ndarray:
+    """Return the numbers of a 4x4 matrix from its rows, from a list of matrices, or from JavaScript's ``data``."""
     if isinstance(entry, list) and len(entry) == 1:
         entry = entry[0]
     numbers = entry.get("data") if isinstance(entry, dict) else entry
@@ -173,11 +186,4 @@ def _matrix(entry: Any, *, where: str) -> np.ndarray:
         numbers = [number for row in numbers for number in row]
     if not isinstance(numbers, list) or len(numbers) != 16:
         raise DataError(f"{where} is {one_line(repr(entry), limit=40)}, 4x4 numbers are needed")
-    matrix = json_numbers(numbers, where=where).reshape(4, 4)
-    if np.allclose(matrix[:3, 3], 0.0) and not np.allclose(matrix[3, :3], 0.0):
-        matrix = matrix.T  # the place of the head belongs into the last column
-    rotation = matrix[:3, :3]
-    bounded = np.isfinite(matrix).all() and np.abs(rotation).max() < 1e3
-    if not bounded or np.linalg.det(rotation) < 1e-6:
-        raise DataError(f"{where} is no rotation and translation")
-    return matrix
+    return json_numbers(numbers, where=where)
