@@ -246,10 +246,13 @@ def evaluate(
     """
     from mgavatar.avatar import Avatar
     from mgavatar.device import find_device
+    from mgavatar.files import check_writable
     from mgavatar.progress import Reporter
     from mgavatar.scoring.evaluate import evaluate as run_evaluate
     from mgavatar.scoring.evaluate import write_metrics
 
+    if json is not None:
+        check_writable(json)
     loaded = Avatar.load(avatar, device=find_device(device))
     own = loaded.config
     subject = _checked_capture(data, background or own.background, principal_point or own.principal_point)

@@ -221,6 +221,33 @@ def test_wrong_options_that_only_the_program_can_know(argv, words, work, mgavata
     assert tree(work) == before
 
 
+@pytest.mark.parametrize(
+    ("command", "flag"),
+    [
+        ("fit", "--out"),
+        ("render", "--out"),
+        ("evaluate", "--json"),
+        ("synth", "--out"),
+        ("demo", "--out"),
+        ("bench", "--json"),
+    ],
+)
+def test_a_place_that_cannot_be_written_to_is_named_before_any_work(command, flag, work, mgavatar):
+    """What the command would read is missing, and yet the first thing said is that its results have no place."""
+    (work / "file").write_text("mine")
+    shutil.rmtree(work / "capture")
+    inputs = {
+        "fit": ["--data", work / "capture"],
+        "render": ["--driving", work / "none.npz", "--avatar", work / "none.pt"],
+        "evaluate": ["--data", work / "capture", "--avatar", work / "none.pt"],
+        "bench": ["kernels"],
+    }
+    before = tree(work)
+    result = mgavatar(command, *inputs.get(command, []), flag, work / "file/result")
+    assert_one_line(result, str(work / "file/result"), "file")
+    assert tree(work) == before
+
+
 def test_a_demo_overwrites_nothing(work, mgavatar):
     """Its folder is a new one."""
     full_folder(work)
