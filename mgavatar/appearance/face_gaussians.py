@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from mgavatar.config import ResolvedAppearanceConfig
 from mgavatar.kernels.binding import place_on_faces
 from mgavatar.kernels.face_frames import face_frames
+from mgavatar.kernels.sparse import SparseMatrix
 
 PARAMETERS = ("local_means", "quats", "log_scales", "opacity_logits")
 """Learnable parameters of every Gaussian, one row each; ``face_ids`` has the same rows."""
@@ -33,14 +34,15 @@ class FaceFrames:
     centers: Tensor
 
     @staticmethod
-    def of(verts: Tensor, faces: Tensor) -> FaceFrames:
+    def of(verts: Tensor, faces: Tensor, *, corners: SparseMatrix | None = None) -> FaceFrames:
         """Compute the frames of a mesh, differentiable in its vertices.
 
         Args:
             verts: Vertices [m], shape [V, 3].
             faces: Vertex indices, shape [F, 3], int32.
+            corners: :func:`~mgavatar.kernels.face_frames.gather_matrix` of ``faces``; prepared here by default.
         """
-        return FaceFrames(*face_frames(verts, faces))
+        return FaceFrames(*face_frames(verts, faces, order=corners))
 
     @property
     def all(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -56,7 +56,7 @@ class FrozenHead:
             parameter.requires_grad_(False)
         with torch.no_grad():
             self.canonical = head.canonical()
-            self.frames = FaceFrames.of(self.canonical, self.body.faces)
+            self.frames = FaceFrames.of(self.canonical, self.body.faces, corners=self.body.face_corners)
         low, high = self.canonical.min(0).values, self.canonical.max(0).values
         self.low, self.high = low, high
         self.extent = float((high - low).norm())
@@ -101,7 +101,8 @@ class FrozenHead:
             still = self.head.posed(pose.without_root()).verts if self._uv is not None else verts
             theta = pose.joint_rotations().reshape(-1)
             pose_map = self._map(still)
-        return PosedMesh(verts, FaceFrames.of(verts, self.body.faces), pose_map, theta)
+        frames = FaceFrames.of(verts, self.body.faces, corners=self.body.face_corners)
+        return PosedMesh(verts, frames, pose_map, theta)
 
     @torch.no_grad()
     def at_timestep(self, timestep: int) -> PosedMesh:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import Pose
 from mgavatar.head.subdivide import subdivide
+from mgavatar.kernels.face_frames import gather_matrix
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.kernels.lbs import blend_shapes, joint_transforms, skin
 from mgavatar.kernels.mesh_geometry import corner_sum, vertex_edge_lengths, vertex_normals
@@ -81,7 +82,7 @@ class Body(nn.Module):
         """Move the matrices with the tensors; torch calls this for ``to`` and ``cuda``."""
         super()._apply(fn, recurse)
         self._subdivision = [step.to(self.device) for step in self._subdivision]
-        for name in ("laplacian", "_corners"):
+        for name in ("laplacian", "face_corners", "_corners"):
             self.__dict__.pop(name, None)  # built again from the moved faces when needed
         return self
 
@@ -99,6 +100,11 @@ class Body(nn.Module):
     def laplacian(self) -> SparseMatrix:
         """Build the neighbour-mean Laplacian of the fine mesh, shape [V, V]."""
         return laplacian_matrix(self.faces, self.n_verts).to(self.device)
+
+    @cached_property
+    def face_corners(self) -> SparseMatrix:
+        """Build the matrix from vertices to the corners of the faces, which face frames take, shape [3 F, V]."""
+        return gather_matrix(self.faces, self.n_verts)
 
     @cached_property
     def _corners(self) -> SparseMatrix:
