@@ -1,7 +1,8 @@
 """Draw a driven avatar beside its mesh, coloured by normals, as a small GIF that loops.
 
-python tools/readme_gif.py --avatar demo_out/run --driving demo_out/driving.npz --out docs/driven.gif \
-        --camera train:11
+    python tools/readme_gif.py --avatar demo_out/run --driving demo_out/driving.npz --out docs/driven.gif
+
+The README's was made with ``--camera train:11``, the camera of the demo's capture that is at the height of the eyes.
 """
 
 from __future__ import annotations
