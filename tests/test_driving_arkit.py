@@ -107,7 +107,7 @@ def test_live_link_without_angles(tmp_path):
     motion = read_driving(write.write_live_link(tmp_path / "take.csv", face(), angles=False))
     assert not motion.neck_pose.any()
     assert not motion.eyes_pose.any()
-    assert "angles" not in notes(motion)
+    assert "taken as" not in notes(motion)
 
 
 @pytest.mark.parametrize(("rate", "expected"), [(60, 60.0), (30, 30.0), (24, 24.0), (25, 25.0)])
