@@ -163,6 +163,7 @@ def render(
     camera: str = "mean",
     head_motion: Literal["full", "neck", "none"] = "full",
     expression: Literal["auto", "use", "ignore"] = "auto",
+    expression_map: Path | None = None,
     format: Literal["auto", "png", "exr", "mp4"] = "auto",
     size: str | None = None,
     frames: str | None = None,
@@ -170,15 +171,16 @@ def render(
     overwrite: bool = False,
     device: str = "auto",
 ) -> None:
-    """Drive an avatar with a sequence of FLAME parameters.
+    """Drive an avatar with a sequence of FLAME parameters or of ARKit's blendshapes.
 
     Args:
         avatar: The avatar, or the folder of its fit.
-        driving: Motion: .npz with VHAP's keys, or a folder with one .npz per frame; missing keys are zero.
+        driving: Motion of a tracker, a phone or a browser, as a file or a folder; docs/driving.md lists the formats.
         out: FILE.mp4, FILE.gif, or a folder for single frames; by default a video named after the motion.
         camera: mean, train:ID, orbit, or a .json with the keys of a transforms frame.
         head_motion: Take the root's motion as driven (full), put it into the neck (neck), or take none.
         expression: Use the expression columns if their basis is the head's (auto), always (use), or ignore them.
+        expression_map: Map from ARKit's blendshapes to the avatar's head; by default by the names of its directions.
         format: Format of single frames, or mp4; by default as --out says.
         size: Image size, WIDTHxHEIGHT; the camera's own by default.
         frames: Frames to draw, START:STOP or START:STOP:STEP, counted from 0.
@@ -188,6 +190,7 @@ def render(
     """
     from mgavatar.avatar import Avatar
     from mgavatar.device import find_device
+    from mgavatar.driving.expression_map import read_expression_map
     from mgavatar.driving.read import read_driving
     from mgavatar.driving.render import render as run_render
     from mgavatar.driving.writers import default_name, kind_of
@@ -203,6 +206,8 @@ def render(
             raise DataError(f"--fps {fps:g}: must lie between 0 and 1000")
         motion = dataclasses.replace(motion, fps=fps)
     loaded = Avatar.load(avatar, device=find_device(device))
+    n_expr = loaded.head_model.n_expr
+    mapped = read_expression_map(expression_map, n_expr=n_expr) if expression_map is not None else None
     with Reporter("render", len(motion)) as reporter:
         notes = run_render(
             loaded,
@@ -211,6 +216,7 @@ def render(
             camera=camera,
             head_motion=head_motion,
             expression=expression,
+            expression_map=mapped,
             format=format,
             size=pixels,
             frames=chosen,

@@ -18,7 +18,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any, BinaryIO, Literal
+from typing import IO, Any, BinaryIO, Literal
 
 import numpy as np
 
@@ -143,19 +143,25 @@ def _npy_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo, *, path: Path) 
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise DataError(f"{path}: {one_line(info.filename)} is compressed in a way that numpy does not write")
     with archive.open(info) as stream:
-        version = np.lib.format.read_magic(stream)
-        readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-        if version not in readers:
-            raise ValueError(f"{info.filename} has format version {version}")
-        with warnings.catch_warnings():  # numpy remarks on headers that Python 2 wrote, as FLAME's texture file has
-            warnings.simplefilter("ignore", UserWarning)
-            shape, fortran, dtype = readers[version](stream)
-        header = _NpyHeader(shape, fortran, dtype, stream.tell())
-    if dtype.kind not in NPZ_KINDS:
-        raise DataError(f"{path}: {one_line(info.filename)} holds {one_line(dtype)}, not plain numbers or strings")
-    if min(shape, default=0) < 0 or info.file_size != header.offset + header.n_bytes:
+        header = _header_of(stream)
+    if header.dtype.kind not in NPZ_KINDS:
+        raise DataError(
+            f"{path}: {one_line(info.filename)} holds {one_line(header.dtype)}, not plain numbers or strings"
+        )
+    if min(header.shape, default=0) < 0 or info.file_size != header.offset + header.n_bytes:
         raise ValueError(f"{info.filename} has {info.file_size} bytes, its header says otherwise")
     return header
+
+
+def _header_of(stream: IO[bytes]) -> _NpyHeader:
+    version = np.lib.format.read_magic(stream)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ValueError(f"format version {version} is unknown")
+    with warnings.catch_warnings():  # numpy remarks on headers that Python 2 wrote, as FLAME's texture file has
+        warnings.simplefilter("ignore", UserWarning)
+        shape, fortran, dtype = readers[version](stream)
+    return _NpyHeader(shape, fortran, dtype, stream.tell())
 
 
 def _npy_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, header: _NpyHeader) -> np.ndarray:
@@ -166,6 +172,26 @@ def _npy_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, header: _NpyHead
     if header.dtype.itemsize == 0:  # numpy writes an empty string with a type of no width
         return np.zeros(header.shape, header.dtype, order)
     return np.frombuffer(data, header.dtype).reshape(header.shape, order=order)
+
+
+def read_npy(path: Path, *, max_bytes: int = GIBIBYTE) -> np.ndarray:
+    """Read a single array of plain numbers (``.npy``); nothing is unpickled.
+
+    Raises:
+        DataError: If the file is missing, damaged or too large, or holds something other than numbers.
+    """
+    data = read_bytes(path, max_bytes=max_bytes)
+    try:
+        header = _header_of(io.BytesIO(data))
+        plain = header.dtype.kind in NPZ_KINDS
+        if plain and (min(header.shape, default=0) < 0 or len(data) != header.offset + header.n_bytes):
+            raise ValueError(f"it has {len(data)} bytes, its header says otherwise")
+    except Exception as error:  # whatever a damaged header makes numpy raise
+        raise DataError(f"{path}: not a readable .npy file ({one_line(error) or type(error).__name__})") from error
+    if not plain or header.dtype.itemsize == 0:
+        raise DataError(f"{path}: holds {one_line(header.dtype)}, not plain numbers")
+    order: Literal["F", "C"] = "F" if header.fortran else "C"
+    return np.frombuffer(data, header.dtype, offset=header.offset).reshape(header.shape, order=order)
 
 
 def float_array(value: np.ndarray, *, where: str) -> np.ndarray:

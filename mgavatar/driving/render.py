@@ -11,6 +11,7 @@ import torch
 from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
 from mgavatar.driving.cameras import cameras_of
+from mgavatar.driving.expression_map import ExpressionMap
 from mgavatar.driving.motion import Driving
 from mgavatar.driving.retarget import ExpressionMode, HeadMotion, driving_notes, head_points, poses_of
 from mgavatar.driving.writers import Format, frame_writer, kind_of
@@ -26,6 +27,7 @@ def render(
     camera: str = "mean",
     head_motion: HeadMotion = "full",
     expression: ExpressionMode = "auto",
+    expression_map: ExpressionMap | None = None,
     format: Format = "auto",
     size: tuple[int, int] | None = None,
     frames: slice | None = None,
@@ -41,6 +43,7 @@ def render(
         camera: ``"mean"``, ``"train:<id>"``, ``"orbit"`` or the path of a ``.json``; see :func:`cameras_of`.
         head_motion: How much of the driven head's motion to take; see :func:`poses_of`.
         expression: What to do with the expression columns; see :func:`mgavatar.driving.driving_expression`.
+        expression_map: Map from ARKit's blendshapes to the avatar's head; by default that of its names.
         format: ``"auto"`` goes by the name of ``out``.
         size: Width and height [px]; the camera's own if None.
         frames: Frames to draw; all if None.
@@ -55,7 +58,14 @@ def render(
     """
     out = Path(out)
     kind = kind_of(out, format, overwrite=overwrite)
-    poses = poses_of(avatar, driving, head_motion=head_motion, expression=expression, frames=frames)
+    poses = poses_of(
+        avatar,
+        driving,
+        head_motion=head_motion,
+        expression=expression,
+        expression_map=expression_map,
+        frames=frames,
+    )
     if not poses:
         raise DataError(f"{driving.path}: no frames are left of its {len(driving)}; choose other frames")
     cameras = cameras_of(avatar, camera, n_frames=len(poses), size=size)
@@ -65,7 +75,8 @@ def render(
             add(avatar.render(pose, view, background), view)
             if progress is not None:
                 progress(index + 1, len(poses))
-    return [*driving_notes(avatar, driving, expression=expression), *_view_notes(avatar, driving, poses, cameras)]
+    notes = driving_notes(avatar, driving, expression=expression, expression_map=expression_map)
+    return [*notes, *_view_notes(avatar, driving, poses, cameras)]
 
 
 def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:

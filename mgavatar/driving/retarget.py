@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -9,7 +10,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mgavatar.avatar import Avatar
+from mgavatar.driving.arkit import BASIS, FEWEST_NAMES, arkit_name, n_arkit_names
+from mgavatar.driving.expression_map import ExpressionMap, listed, map_by_names
 from mgavatar.driving.motion import Driving
+from mgavatar.errors import DataError
+from mgavatar.head.model import HeadModel
 from mgavatar.head.params import Pose
 
 ExpressionMode = Literal["use", "ignore", "auto"]
@@ -81,22 +86,95 @@ def _matched_by_name(driving: Driving, expr_names: tuple[str, ...]) -> tuple[np.
             expr[:, column_of[name]] = values
         else:
             unmatched.append(name)
-    if not unmatched:
-        return expr, None
-    shown = ", ".join(unmatched[:5]) + (", …" if len(unmatched) > 5 else "")
-    return (
+    return expr, _unmatched_note(driving, unmatched)
+
+
+def _unmatched_note(driving: Driving, names: list[str]) -> str | None:
+    if not names:
+        return None
+    n = len(driving.expr_names)
+    return f"{driving.path}: {len(names)} of {n} expressions are not the head's: {listed(names)}"
+
+
+@dataclass(frozen=True, eq=False)
+class HeadExpression:
+    """The part of a motion that moves the face of a head, over T frames.
+
+    Attributes:
+        expr: Coefficients of the head's own directions, shape [T, E], float32.
+        jaw_pose: Rotation vectors [rad], shape [T, 3].
+        eyes_pose: Rotation vectors of left and right eye [rad], shape [T, 6].
+        notes: What was not used, one line each.
+    """
+
+    expr: np.ndarray
+    jaw_pose: np.ndarray
+    eyes_pose: np.ndarray
+    notes: tuple[str, ...]
+
+
+def is_arkit(driving: Driving) -> bool:
+    """Return True if the expression columns are ARKit's blendshapes, by their names."""
+    return driving.expr_basis == BASIS or n_arkit_names(driving.expr_names) >= max(FEWEST_NAMES, driving.expr.shape[1])
+
+
+def expression_on(
+    driving: Driving, model: HeadModel, *, mode: ExpressionMode = "auto", expression_map: ExpressionMap | None = None
+) -> HeadExpression:
+    """Return the expression, jaw and eyes that a motion gives a head.
+
+    ARKit's blendshapes go through a map: the one given, or that of the head's names. The motion's own jaw adds to that
+    of the map; its own eyes, where a file has angles, take the place of those of the map. Everything else is taken as
+    :func:`driving_expression` says.
+
+    Args:
+        driving: The motion.
+        model: The head.
+        mode: Treatment of the expression columns; with ``"ignore"`` blendshapes move jaw and eyes only.
+        expression_map: Map from ARKit's blendshapes to the head.
+
+    Raises:
+        DataError: If the motion has blendshapes and there is no map for the head.
+    """
+    if not is_arkit(driving):
+        expr, note = driving_expression(
+            driving, n_expr=model.n_expr, expr_basis=model.expr_basis, expr_names=model.expr_names, mode=mode
+        )
+        return HeadExpression(expr, driving.jaw_pose, driving.eyes_pose, (note,) if note else ())
+    mapped = expression_map or map_by_names(model)
+    if mapped is None:
+        raise DataError(
+            f"{driving.path}: holds ARKit's blendshapes, but {model.name} names no directions for them; give "
+            "--expression-map FILE"
+        )
+    names = [arkit_name(name) or name for name in driving.expr_names]
+    expr, jaw, eyes = mapped.apply(names, driving.expr)
+    if mode == "ignore":
+        expr = np.zeros_like(expr)
+    moving = [name for name, column in zip(names, driving.expr.T, strict=True) if column.any()]
+    without = {*mapped.unmapped, *(set(moving) - set(mapped.names))}
+    note = _unmatched_note(driving, [name for name in moving if name in without])
+    return HeadExpression(
         expr,
-        f"{driving.path}: {len(unmatched)} of {len(driving.expr_names)} expressions are not the head's: {shown}",
+        driving.jaw_pose + jaw,
+        driving.eyes_pose if driving.eyes_pose.any() else eyes,
+        (note,) if note else (),
     )
 
 
 HeadMotion = Literal["full", "neck", "none"]
 
 
-def driving_notes(avatar: Avatar, driving: Driving, *, expression: ExpressionMode = "auto") -> list[str]:
+def driving_notes(
+    avatar: Avatar,
+    driving: Driving,
+    *,
+    expression: ExpressionMode = "auto",
+    expression_map: ExpressionMap | None = None,
+) -> list[str]:
     """List what an avatar does not use of a driving sequence, one line each."""
-    note = _expression(avatar, driving, expression)[1]
-    return [*driving.notes, *([note] if note else [])]
+    used = expression_on(driving, avatar.head_model, mode=expression, expression_map=expression_map)
+    return [*driving.notes, *used.notes]
 
 
 def poses_of(
@@ -105,6 +183,7 @@ def poses_of(
     *,
     head_motion: HeadMotion = "full",
     expression: ExpressionMode = "auto",
+    expression_map: ExpressionMap | None = None,
     frames: slice | None = None,
 ) -> list[Pose]:
     """Return the poses of an avatar under a driving sequence.
@@ -121,13 +200,14 @@ def poses_of(
         driving: The motion.
         head_motion: Treatment of root and neck.
         expression: Treatment of the expression columns, see :func:`driving_expression`.
+        expression_map: Map from ARKit's blendshapes to the head, see :func:`expression_on`.
         frames: Frames to return; None returns all of them. Means are those of all frames in any case.
 
     Returns:
         Poses on the CPU.
     """
     mean = avatar.mean_pose()
-    expr = _expression(avatar, driving, expression)[0]
+    face = expression_on(driving, avatar.head_model, mode=expression, expression_map=expression_map)
     rotation, neck = driving.rotation, driving.neck_pose
     if head_motion == "full":
         translation = driving.translation + _shift(avatar, driving, mean)
@@ -141,7 +221,7 @@ def poses_of(
             neck = np.broadcast_to(mean.neck_pose.numpy(), neck.shape)
         rotation = np.broadcast_to(mean.rotation.numpy(), rotation.shape)
     chosen = frames or slice(None)
-    columns = (expr, rotation, neck, driving.jaw_pose, driving.eyes_pose, translation)
+    columns = (face.expr, rotation, neck, face.jaw_pose, face.eyes_pose, translation)
     tensors = [torch.tensor(np.ascontiguousarray(column[chosen]), dtype=torch.float32) for column in columns]
     return [Pose(*row) for row in zip(*tensors, strict=True)]
 
@@ -172,10 +252,3 @@ def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:
     own = head_points(avatar, *(value.numpy()[None] for value in (mean.rotation, mean.neck_pose, mean.translation)))
     driven = head_points(avatar, driving.rotation, driving.neck_pose, driving.translation)
     return (own.mean(axis=0) - driven.mean(axis=0)).astype(np.float32)
-
-
-def _expression(avatar: Avatar, driving: Driving, mode: ExpressionMode) -> tuple[np.ndarray, str | None]:
-    model = avatar.head_model
-    return driving_expression(
-        driving, n_expr=model.n_expr, expr_basis=model.expr_basis, expr_names=model.expr_names, mode=mode
-    )
