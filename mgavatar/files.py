@@ -38,12 +38,44 @@ def one_line(text: object, *, limit: int = 200) -> str:
 
 
 def existing_file(path: Path) -> Path:
-    """Return ``path``, or raise ``DataError`` if no regular file is there (a pipe would wait for ever)."""
-    if path.is_file():
-        return path
-    if path.is_dir():
+    """Return ``path`` if a regular file is there; a pipe would be read for ever.
+
+    Raises:
+        DataError: If nothing or anything else is there, or its folder cannot be read.
+    """
+    with reading(path):  # Python raises where a folder may not be searched, or a name is too long
+        is_file, is_folder, exists = path.is_file(), path.is_dir(), path.exists()
+    if is_folder:
         raise DataError(f"{path}: is a folder, a file is needed")
-    raise DataError(f"{path}: {'not a regular file' if path.exists() else 'no such file'}")
+    if not is_file:
+        raise DataError(f"{path}: {'not a regular file' if exists else 'no such file'}")
+    return path
+
+
+def existing_folder(path: Path) -> Path:
+    """Return ``path`` if a folder is there.
+
+    Raises:
+        DataError: If nothing or anything else is there, or the folder above cannot be read.
+    """
+    with reading(path):
+        is_folder, exists = path.is_dir(), path.exists()
+    if not is_folder:
+        raise DataError(f"{path}: {'is a file, a folder is needed' if exists else 'no such folder'}")
+    return path
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to read inside the block into one line that names ``path``.
+
+    Raises:
+        DataError: In the place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {one_line(error.strerror or error)}") from error
 
 
 def read_bytes(path: Path, *, max_bytes: int) -> bytes:
@@ -52,12 +84,8 @@ def read_bytes(path: Path, *, max_bytes: int) -> bytes:
     Raises:
         DataError: If the file is missing, longer, or cannot be read.
     """
-    existing_file(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(max_bytes + 1)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {one_line(error.strerror)}") from error
+    with reading(existing_file(path)), path.open("rb") as file:
+        data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise DataError(f"{path}: longer than {max_bytes / 2**20:.0f} MiB; this is not the kind of file expected here")
     return data

@@ -179,7 +179,7 @@ def test_every_reader_is_tried():
 
 
 def test_a_file_in_the_place_of_the_folder(root):
-    refusal(lambda: read_capture(root / "transforms_train.json"), "is a file, the folder of a capture is needed")
+    refusal(lambda: read_capture(root / "transforms_train.json"), "is a file, a folder is needed")
 
 
 def test_missing_folder(tmp_path):

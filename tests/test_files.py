@@ -20,6 +20,7 @@ from tiny_avatar import tiny_avatar
 import mgavatar
 from mgavatar import files
 from mgavatar.avatar import Avatar
+from mgavatar.capture.read import read_capture
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.demo import run_demo
@@ -29,7 +30,10 @@ from mgavatar.files import (
     append_line,
     atomic_write,
     check_writable,
+    existing_file,
+    existing_folder,
     make_folder,
+    read_json,
     require_new_folder,
     write_json,
     write_text,
@@ -289,6 +293,20 @@ def test_every_new_folder_has_the_same_wording(tmp_path, fitted, name):
     words = "already exists and is not an empty folder; give --out another name"
     refusal(action.get(name, lambda: FOLDER_WRITERS[name](tmp_path / "result", fitted)), f"result: {words}")
     assert everything_below(tmp_path) == before
+
+
+def test_a_path_that_the_system_refuses_to_look_at(tmp_path):
+    """A name that is too long, or below a file, is one line like a file that is missing."""
+    (tmp_path / "file").write_text("x")
+    for name, words in (
+        ("n" * 300, "cannot be read: File name too long"),
+        ("file/x", "no such"),
+        ("none", "no such"),
+    ):
+        for read in (existing_file, existing_folder, read_capture, read_json):
+            refusal(lambda read=read, name=name: read(tmp_path / name), tmp_path / name, words)
+    refusal(lambda: existing_file(tmp_path), f"{tmp_path}: is a folder, a file is needed")
+    refusal(lambda: existing_folder(tmp_path / "file"), "file: is a file, a folder is needed")
 
 
 RAW_WRITES = {

@@ -9,6 +9,7 @@ from mgavatar.capture.readers import vhap
 from mgavatar.capture.subject import Subject
 from mgavatar.config import Background, PrincipalPoint
 from mgavatar.errors import DataError
+from mgavatar.files import existing_folder
 
 
 class Reader(Protocol):
@@ -64,10 +65,7 @@ def read_capture(
 
 def _reader_of(root: Path) -> Reader:
     """Return the first reader that recognises a folder."""
-    if not root.is_dir():
-        raise DataError(
-            f"{root}: {'is a file, the folder of a capture is needed' if root.exists() else 'no such folder'}"
-        )
+    existing_folder(root)
     for reader in READERS:
         if reader.recognises(root):
             return reader

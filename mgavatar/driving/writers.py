@@ -22,7 +22,7 @@ from torch import Tensor
 from mgavatar import __version__
 from mgavatar.camera import Camera
 from mgavatar.errors import DataError
-from mgavatar.files import check_writable, one_line, require_new_folder, writing
+from mgavatar.files import check_writable, reading, require_new_folder, writing
 from mgavatar.kernels.rasterize import Rendering
 
 FileKind = Literal["mp4", "gif", "png", "exr"]
@@ -105,11 +105,9 @@ def _check_replaceable(out: Path, kind: FileKind, *, overwrite: bool) -> None:
 
 
 def _first_bytes(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {one_line(error.strerror)}") from error
+    with reading(path), path.open("rb") as file:
+        start = file.read(16)
+    return start
 
 
 @contextlib.contextmanager
@@ -131,22 +129,17 @@ def frame_writer(out: Path, kind: FileKind, *, fps: float) -> Iterator[FrameSink
     writers = {"mp4": _mp4, "gif": _gif, "png": _png_folder, "exr": _exr_folder}
     try:
         with writing(out):
-            _remove(partial)
-            with writers[kind](partial, fps) as sink:
+            shutil.rmtree(partial, ignore_errors=True)
+            # A folder for files too: after a failed write PyAV opens the name again when the container is collected,
+            # and would leave a file behind if its folder were still there.
+            partial.mkdir()
+            with writers[kind](partial / out.name, fps) as sink:
                 yield sink
             if out.is_dir():
                 out.rmdir()
-            os.replace(partial, out)
+            os.replace(partial / out.name, out)
     finally:
-        _remove(partial)
-
-
-def _remove(path: Path) -> None:
-    """Remove a file or a folder as far as the system allows; an error would hide the one that led here."""
-    if path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 @dataclass
