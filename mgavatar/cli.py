@@ -15,7 +15,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -24,9 +24,6 @@ from mgavatar import config as configs
 from mgavatar.config import Background, FitConfig, PrincipalPoint
 from mgavatar.errors import DataError
 from mgavatar.presets import preset, preset_names, preset_summary
-
-if TYPE_CHECKING:
-    from mgavatar.capture.subject import Subject
 
 DEFAULT_PRESET = "quick"
 
@@ -110,6 +107,8 @@ def fit(
     seed: int = 0,
     resume: bool = False,
     budget: str | None = None,
+    skip_bad: bool = False,
+    follow_links: bool = False,
     config: Config = FitConfig(),  # noqa: B008  frozen
 ) -> None:
     """Fit an avatar to a tracked capture.
@@ -123,6 +122,8 @@ def fit(
         seed: Seed of all random draws; a fit repeats bit for bit on one machine.
         resume: Continue the fit in --out.
         budget: Time after which the avatar is written, such as 90s, 5m or 1h, counted from now.
+        skip_bad: Leave out frames with missing or damaged files or NaN, and name them, instead of refusing the capture.
+        follow_links: Follow all symbolic links out of the capture; those of whole folders are always followed.
         config: Every number of the method.
     """
     # The clock starts before the heavy imports.
@@ -139,7 +140,13 @@ def fit(
     check_seed(seed)
     configs.check(config)
     open_run(out, resume=resume)  # what is wrong with --out is said before the capture is read
-    subject = read_capture(data, background=config.background, principal_point=config.principal_point)
+    subject = read_capture(
+        data,
+        background=config.background,
+        principal_point=config.principal_point,
+        skip_bad=skip_bad,
+        follow_links=follow_links,
+    )
     head = resolve_head_model(head_model, data)
     with FitReporter() as reporter:
         result = run_fit(
@@ -236,6 +243,8 @@ def evaluate(
     lpips_weights: Path | None = None,
     background: Background | None = None,
     principal_point: PrincipalPoint | None = None,
+    skip_bad: bool = False,
+    follow_links: bool = False,
     device: str = "auto",
 ) -> None:
     """Score an avatar on the held-out frames of a capture, at full size.
@@ -248,9 +257,14 @@ def evaluate(
         lpips_weights: State dict of LPIPS-VGG; nothing is ever downloaded.
         background: As in fit; the avatar's own by default.
         principal_point: As in fit; the avatar's own by default.
+        skip_bad: As in fit.
+        follow_links: As in fit.
         device: auto, cpu, cuda or cuda:N.
     """
     from mgavatar.avatar import Avatar
+    from mgavatar.capture.images import check_images
+    from mgavatar.capture.placement import check_placement
+    from mgavatar.capture.read import read_capture
     from mgavatar.device import find_device
     from mgavatar.files import check_writable
     from mgavatar.progress import Reporter
@@ -261,7 +275,15 @@ def evaluate(
         check_writable(json)
     loaded = Avatar.load(avatar, device=find_device(device))
     own = loaded.config
-    subject = _checked_capture(data, background or own.background, principal_point or own.principal_point)
+    subject = read_capture(
+        data,
+        background=background or own.background,
+        principal_point=principal_point or own.principal_point,
+        skip_bad=skip_bad,
+        follow_links=follow_links,
+    )
+    check_images(subject)
+    check_placement(subject, loaded.head_model)
     splits: tuple[Literal["val", "test"], ...] = ("val", "test") if split == "all" else (split,)
     with Reporter("evaluate", sum(len(subject.frames[name]) for name in splits)) as reporter:
         metrics = run_evaluate(
@@ -317,16 +339,6 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": evaluate,
     "bench": bench,
 }
-
-
-def _checked_capture(data: Path, background: Background, principal_point: PrincipalPoint) -> Subject:
-    """Read a capture and decode every image once, so that a bad file is found before any work."""
-    from mgavatar.capture.images import check_images
-    from mgavatar.capture.read import read_capture
-
-    subject = read_capture(data, background=background, principal_point=principal_point)
-    check_images(subject)
-    return subject
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -41,8 +42,35 @@ Levels = Annotated[int, Range(1, 32)]
 Cells = Annotated[int, Range(1, 1_048_576)]
 MapSize = Annotated[int, Range(16, 1024)]
 
-Background = Literal["white", "black"]
+Background = str
+"""``"white"``, ``"black"`` or ``"R,G,B"``: see :func:`background_color`."""
 PrincipalPoint = Literal["center", "opencv", "opengl"]
+
+
+BACKGROUNDS: dict[str, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""RGB in 0..1 of the backgrounds that have a name."""
+
+
+def background_color(text: Background) -> tuple[float, float, float]:
+    """Return the RGB in 0..1 of a background.
+
+    Args:
+        text: ``"white"``, ``"black"``, or three numbers with commas: 0 to 255, or 0 to 1 if none is above 1.
+
+    Raises:
+        ValueError: If it is something else.
+    """
+    if text in BACKGROUNDS:
+        return BACKGROUNDS[text]
+    try:
+        red, green, blue = (float(number) for number in text.split(","))
+    except (ValueError, AttributeError):
+        red = green = blue = math.nan
+    highest = max(red, green, blue)
+    if not (min(red, green, blue) >= 0.0 and highest <= 255.0):  # false for NaN
+        raise ValueError(f"must be {', '.join(BACKGROUNDS)} or R,G,B with numbers from 0 to 255")
+    scale = 255.0 if highest > 1.0 else 1.0
+    return red / scale, green / scale, blue / scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,7 +317,7 @@ class FitConfig:
     """A whole fit."""
 
     background: Background = "white"
-    """Colour that the capture's images are composited on."""
+    """Colour that the capture's images are composited on: white, black, or R,G,B from 0 to 255."""
     principal_point: PrincipalPoint = "center"
     """Principal point: the image centre, or cx, cy from the file, counted from the top (opencv) or bottom (opengl)."""
     random_background: bool = False
@@ -472,6 +500,8 @@ def _wanted(hint: Any) -> str:
         bounds, base = _range_of(option), _base_of(option)
         if get_origin(base) is Literal:
             words += [str(word) for word in get_args(base)]
+        elif base is str:
+            words.append("text")
         elif base is bool:
             words += ["true", "false"]
         elif bounds is not None:
@@ -488,6 +518,10 @@ def _check_pairs(config: Any) -> None:
     """Check what one key's range cannot say."""
     if not isinstance(config, FitConfig):
         return
+    try:
+        background_color(config.background)
+    except ValueError as error:
+        raise ValueError(f"--background {_shown(config.background)}: {error}") from error
     grid, maps = config.appearance.color_net, config.appearance.offset_net
     if grid.max_resolution != "auto" and grid.max_resolution < grid.base_resolution:
         raise ValueError(

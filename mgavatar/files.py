@@ -15,7 +15,7 @@ import os
 import tempfile
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
 from typing import IO, Any, BinaryIO, Literal
@@ -104,6 +104,31 @@ def read_json(path: Path, *, max_bytes: int = GIBIBYTE // 4) -> Any:
         raise DataError(f"{path}: not valid JSON ({one_line(error)})") from error
 
 
+def foreign_content(path: Path) -> str | None:
+    """Describe a file that is no data at all, but what a failed download leaves in its place, with the remedy.
+
+    Returns:
+        A clause for the message of an error, or None if the file is nothing of this kind.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(1024).lstrip(b"\xef\xbb\xbf \t\r\n")
+    except OSError:
+        return None
+    text = start.lower()
+    if not text:
+        return "the file is empty; download it again"
+    if text.startswith(b"version https://git-lfs"):
+        return "it is a pointer file of Git LFS; fetch the file itself with `git lfs pull`"
+    if text.startswith((b"<!doctype html", b"<html", b"<head", b"<?xml", b"<script")) or b"<html" in text:
+        return "it is a web page (HTML), perhaps a login page; download the file again, logged in"
+    if text.startswith((b'{"', b"{'")) and b"error" in text:
+        return "it is the error message of a server; download the file again, logged in"
+    if text.startswith(b"/annex/objects"):
+        return "it is a pointer file of git-annex; fetch the file itself with `git annex get`"
+    return None
+
+
 @dataclass(frozen=True)
 class NpzContent:
     """Contents of an ``.npz`` file: the wanted arrays (read-only), and the names of the others."""
@@ -140,7 +165,8 @@ def read_npz(path: Path, *, wanted: Callable[[str], bool], max_bytes: int = GIBI
     except DataError:
         raise
     except Exception as error:  # whatever a damaged archive makes zipfile, zlib and numpy raise
-        raise DataError(f"{path}: not a readable .npz file ({one_line(error) or type(error).__name__})") from error
+        reason = foreign_content(path) or one_line(error) or type(error).__name__
+        raise DataError(f"{path}: not a readable .npz file ({reason})") from error
     return NpzContent(arrays, tuple(one_line(name, limit=40) for name in members if name not in chosen))
 
 
@@ -242,7 +268,9 @@ def float_array(value: np.ndarray, *, where: str) -> np.ndarray:
     return array
 
 
-def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path:
+def path_inside(
+    entry: object, *, base: Path, allowed: Path, where: str, linked: Collection[Path] = (), remedy: str = ""
+) -> Path:
     """Return the existing file that a capture names, if it lies below ``allowed``.
 
     Args:
@@ -250,6 +278,8 @@ def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path
         base: Folder that ``entry`` is relative to, already resolved.
         allowed: Folder that the file must be in, already resolved.
         where: Begins the message: the file and the entry of it that is read.
+        linked: Folders outside ``allowed`` that links inside it may lead to, already resolved.
+        remedy: Ends the message about a link that leads anywhere else.
 
     Returns:
         The file's resolved path.
@@ -273,8 +303,8 @@ def path_inside(entry: object, *, base: Path, allowed: Path, where: str) -> Path
         raise DataError(f"{where}: {shown} does not exist") from error
     except (OSError, RuntimeError, ValueError) as error:  # too long, a file as a folder, a loop of links, no text
         raise DataError(f"{where}: {shown} cannot be opened ({type(error).__name__})") from error
-    if not found.is_relative_to(allowed):
-        raise outside
+    if not any(found.is_relative_to(folder) for folder in (allowed, *linked)):
+        raise DataError(f"{outside}{remedy}")
     if not found.is_file():
         raise DataError(f"{where}: {shown} is not a file")
     return found

@@ -13,6 +13,7 @@ import torch
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.images import check_images
+from mgavatar.capture.placement import check_placement
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig, check
 from mgavatar.device import find_device
@@ -110,6 +111,7 @@ def fit(
     check_ground_truth(subject)
     check_images(subject)
     _warn_of_truncated_parameters(subject, head_model)
+    check_placement(subject, head_model)
     try:
         avatar = fit_avatar(
             subject,
@@ -149,7 +151,8 @@ def _warn_of_truncated_parameters(subject: Subject, head_model: HeadModel) -> No
     for name, (values, n) in widths.items():
         if np.any(values[..., n:]):
             log.warning(
-                "%s: %s has %d columns, %s takes %d: the rest is cut",
+                "%s: %s has %d columns, %s takes %d: the rest is cut; is it the head model that the capture was "
+                "tracked with?",
                 subject.root,
                 name,
                 values.shape[-1],

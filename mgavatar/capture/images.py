@@ -4,28 +4,38 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections import Counter
+import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from dataclasses import dataclass, replace
 
-import kornia_rs.io
 import numpy as np
 import scipy.sparse
 import torch
-from PIL import Image
 from torch import Tensor
 
-from mgavatar.capture.subject import BACKGROUNDS, SPLITS, Frame, Subject
-from mgavatar.config import Background
+from mgavatar.capture.pixels import read_matte, read_pixels
+from mgavatar.capture.subject import SPLITS, Frame, Subject
+from mgavatar.config import BACKGROUNDS
 from mgavatar.errors import DataError
-from mgavatar.files import existing_file, one_line
+
+_CLOSE = 0.1
+"""Difference in a channel up to which two colours count as one background."""
+
+_MOST = 0.8
+"""Share of the pixels behind a subject that are on one background: masks may be a little too tight."""
+
+_SAMPLE = 16_384
+"""Number of pixels of an image that its background is looked up in."""
 
 log = logging.getLogger("mgavatar")
 
 
 def read_images(frames: Sequence[Frame], *, size: tuple[int, int] | None = None, threads: int = 2) -> Tensor:
-    """Decode the images of frames.
+    """Decode the images of frames, and put them on the background of their frames.
+
+    Images with a matte in their alpha channel are composited, and so are images that show something else behind their
+    mask.
 
     Args:
         frames: The frames, in the order of the result.
@@ -37,14 +47,14 @@ def read_images(frames: Sequence[Frame], *, size: tuple[int, int] | None = None,
         Images, shape [N, 3, H, W], uint8, on the CPU.
 
     Raises:
-        DataError: If a file is missing, damaged, transparent or not as large as its camera says, or if the sizes
+        DataError: If a file is missing, damaged or not as large as its camera says, or if the sizes
             differ and no ``size`` is given.
     """
     width, height = _common_size(frames, size)
     images = torch.empty((len(frames), 3, height, width), dtype=torch.uint8)
 
     def load(index: int) -> None:
-        pixels = _resampled(_read_image(frames[index]), width, height)
+        pixels = _resampled(_Picture.read(frames[index]).pixels, width, height)
         images[index] = torch.from_numpy(pixels).permute(2, 0, 1)
 
     _for_all(load, len(frames), threads)
@@ -64,7 +74,7 @@ def read_masks(frames: Sequence[Frame], *, size: tuple[int, int] | None = None, 
     masks = torch.empty((len(frames), height, width), dtype=torch.uint8)
 
     def load(index: int) -> None:
-        masks[index] = torch.from_numpy(_resampled(_read_mask(frames[index]), width, height)[..., 0])
+        masks[index] = torch.from_numpy(_resampled(_read_mask(frames[index])[..., None], width, height)[..., 0])
 
     _for_all(load, len(frames), threads)
     return masks
@@ -73,70 +83,214 @@ def read_masks(frames: Sequence[Frame], *, size: tuple[int, int] | None = None, 
 def check_images(subject: Subject, *, threads: int = 2) -> None:
     """Decode every image and mask of every split once, so that a bad file is found before any work is done.
 
-    The background is looked up where a mask is empty, or in the upper corners of an image without a mask. Logs a
-    warning if that of some images is not the stated one.
+    The background is looked up where a mask is empty, or in the upper corners of an image without a mask. Logs what is
+    composited, which images have no mask, and which of these are not on the stated background.
 
     Raises:
         DataError: For the first bad file, in the order of the splits and frames, and if all images are on another
-            background than ``subject`` states.
+            background with a name than ``subject`` states.
     """
     frames = [frame for split in SPLITS for frame in subject.frames[split]]
-    found: list[np.ndarray | None] = [None] * len(frames)
+    found: list[_Behind | None] = [None] * len(frames)
 
     def check(index: int) -> None:
-        found[index] = _background(frames[index])
+        found[index] = _Picture.read(frames[index]).behind
 
     _for_all(check, len(frames), threads)
-    _check_backgrounds(subject, frames, found)
+    _check_backgrounds(subject, [(frame, look) for frame, look in zip(frames, found, strict=True) if look is not None])
+    _warn_of_missing_masks(subject)
 
 
-def _background(frame: Frame) -> np.ndarray | None:
-    """Return the colour behind the subject, RGB in 0..1, shape [3], or None where the subject covers everything."""
-    pixels = _read_image(frame)
-    if frame.mask_path is not None:
-        behind = pixels[_read_mask(frame)[..., 0] == 0]
-    else:
-        corner = max(1, pixels.shape[1] // 16)
-        behind = np.concatenate([pixels[:corner, :corner], pixels[:corner, -corner:]]).reshape(-1, 3)
-    return np.median(behind, axis=0) / 255.0 if len(behind) else None
+def without_bad_images(subject: Subject, *, threads: int = 2) -> Subject:
+    """Return a capture without the frames whose image or mask cannot be decoded; logs their names.
 
-
-def _check_backgrounds(subject: Subject, frames: Sequence[Frame], found: Sequence[np.ndarray | None]) -> None:
-    """Refuse a capture that is on another background than stated; warn if only some of its images are.
-
-    Images without masks may show a room: of them only those on another known background count.
+    Raises:
+        DataError: If no training image is left.
     """
-    seen = [(frame, color) for frame, color in zip(frames, found, strict=True) if color is not None]
-    off = [(frame, _name_of(color)) for frame, color in seen if not _is_close(color, subject.background)]
-    off = [(frame, name) for frame, name in off if frame.mask_path is not None or name is not None]
+    frames = [frame for split in SPLITS for frame in subject.frames[split]]
+    errors: list[DataError | None] = [None] * len(frames)
+
+    def check(index: int) -> None:
+        try:
+            _Picture.read(frames[index])
+        except DataError as error:
+            errors[index] = error
+
+    _for_all(check, len(frames), threads)
+    bad = {frame: error for frame, error in zip(frames, errors, strict=True) if error is not None}
+    if not bad:
+        return subject
+    first = next(iter(bad.values()))
+    kept = {split: tuple(frame for frame in subject.frames[split] if frame not in bad) for split in SPLITS}
+    if not kept["train"]:
+        raise DataError(f"{first}; and no training image is better")
+    log.warning("%s: %d images are left out, the first because of %s", subject.root, len(bad), first)
+    return replace(subject, frames=kept)
+
+
+@dataclass(frozen=True)
+class _Behind:
+    """Colours behind the subject in an image as it was stored.
+
+    Attributes:
+        color: The median, RGB in 0..1.
+        is_plain: Nearly all pixels have this colour.
+        is_off: Many pixels have another colour than the stated background.
+        is_composited: The image's mask or alpha channel has put it on the stated background.
+    """
+
+    color: np.ndarray
+    is_plain: bool
+    is_off: bool
+    is_composited: bool
+
+    @property
+    def name(self) -> str | None:
+        """Return the name of a known background, or None for any other colour."""
+        known = (name for name, value in BACKGROUNDS.items() if _is_close(self.color, np.array(value)))
+        return next(known, None) if self.is_plain else None
+
+    @property
+    def flag(self) -> str:
+        """Return the value of ``--background`` for this colour."""
+        return self.name or ",".join(str(value) for value in np.rint(255.0 * self.color).astype(int))
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """An image on the stated background, shape [H, W, 3], uint8, and what was behind the subject before, if known."""
+
+    pixels: np.ndarray
+    behind: _Behind | None
+
+    @staticmethod
+    def read(frame: Frame) -> _Picture:
+        """Decode an image, and composite it if its alpha channel or its mask says that this is needed."""
+        size = (frame.camera.width, frame.camera.height)
+        pixels = read_pixels(frame.image_path, size)
+        if pixels.shape[2] == 4:
+            alpha, pixels = pixels[..., 3], pixels[..., :3]
+            if alpha.min() < 255:
+                return _Picture(_blended(pixels, alpha, frame.background), None)
+        elif pixels.shape[2] == 1:
+            pixels = np.broadcast_to(pixels, (*pixels.shape[:2], 3))
+        if frame.mask_path is None:
+            corner = max(1, pixels.shape[1] // 16)
+            corners = np.concatenate([pixels[:corner, :corner], pixels[:corner, -corner:]]).reshape(-1, 3)
+            return _Picture(pixels, _behind(corners, frame.background, masked=False))
+        matte = _read_mask(frame)
+        look = _behind(_outside(pixels, matte), frame.background, masked=True)
+        if look is None or not look.is_composited:
+            return _Picture(pixels, look)
+        if look.is_plain:
+            return _Picture(_moved(pixels, matte, look.color, frame.background), look)
+        return _Picture(_blended(pixels, matte, frame.background), look)
+
+
+def _outside(pixels: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """Return a sample of the pixels where the matte is empty, shape [N, 3]."""
+    step = max(1, math.isqrt(matte.size // _SAMPLE))
+    return pixels[::step, ::step][matte[::step, ::step] == 0]
+
+
+def _behind(colors: np.ndarray, background: tuple[float, float, float], *, masked: bool) -> _Behind | None:
+    """Judge a sample of colours behind the subject, shape [N, 3], uint8; None if there are none."""
+    if not len(colors):
+        return None
+    median = np.median(colors, axis=0)
+    stated = 255.0 * np.array(background)
+    plain = float(_close_share(colors, median)) > _MOST
+    off = float(_close_share(colors, stated)) < _MOST
+    return _Behind(median / 255.0, plain, off, masked and off)
+
+
+def _close_share(colors: np.ndarray, color: np.ndarray) -> float:
+    return float((np.abs(colors - color).max(axis=1) <= 255.0 * _CLOSE).mean())
+
+
+def _blended(pixels: np.ndarray, matte: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
+    """Composite straight colours on a background."""
+    alpha = matte[..., None].astype(np.float32) / 255.0
+    return np.rint(alpha * pixels + (1.0 - alpha) * (255.0 * np.array(background, np.float32))).astype(np.uint8)
+
+
+def _moved(
+    pixels: np.ndarray, matte: np.ndarray, old: np.ndarray, background: tuple[float, float, float]
+) -> np.ndarray:
+    """Exchange a plain background: its share of a pixel on the outline, which is known, is exchanged with it."""
+    clear = 1.0 - matte[..., None].astype(np.float32) / 255.0
+    change = 255.0 * (np.array(background, np.float32) - old.astype(np.float32))
+    return np.rint(pixels + clear * change).clip(0.0, 255.0).astype(np.uint8)
+
+
+def _check_backgrounds(subject: Subject, seen: Sequence[tuple[Frame, _Behind]]) -> None:
+    """Refuse a capture that is on another background with a name; say what is composited, and what should be.
+
+    Images without masks may show a room: of them only plain backgrounds count.
+    """
+    off = [(frame, look) for frame, look in seen if look.is_off and (look.is_composited or look.is_plain)]
     if not off:
         return
-    name, count = Counter(name for _, name in off).most_common(1)[0]
-    stated = ", ".join(f"{value:g}" for value in subject.background)
-    if name is not None and count == len(seen):
+    frame, look = off[0]
+    same = len(off) == len(seen) and all(other.is_plain and _is_close(other.color, look.color) for _, other in off)
+    stated = _shown(subject.background)
+    if same and look.name is not None:
         raise DataError(
-            f"{subject.root}: the images are on {name}, not on the stated background (RGB {stated}), for example "
-            f"{off[0][0].image_path}; give --background {name}"
+            f"{subject.root}: the images are on {look.name}, not on the stated background (RGB {stated}), for example "
+            f"{frame.image_path}; give --background {look.name}"
         )
-    log.warning(
-        "%s: %d of %d images are not on the stated background (RGB %s), for example %s; composite them on it with "
-        "their masks%s",
-        subject.root,
-        len(off),
-        len(frames),
-        stated,
-        off[0][0].image_path,
-        "" if name is None else f", or give --background {name} if that is the background of the others",
-    )
+    keep = f"; --background {look.flag} would keep theirs" if same else ""
+    if composited := [(frame, look) for frame, look in off if look.is_composited]:
+        frame, look = composited[0]
+        log.warning(
+            "%s: %d of %d images show something else than the stated background behind the subject, for example %s "
+            "(RGB %s); they are composited on it (RGB %s) with their masks%s",
+            subject.root,
+            len(composited),
+            len(seen),
+            frame.image_path,
+            _shown(look.color),
+            stated,
+            keep,
+        )
+    if plain := [(frame, look) for frame, look in off if not look.is_composited]:
+        frame, look = plain[0]
+        flag = "" if look.name is None and not same else f", or give --background {look.flag}"
+        log.warning(
+            "%s: %d of %d images are not on the stated background (RGB %s), for example %s (RGB %s), and have no masks "
+            "to composite them with; give them masks%s%s",
+            subject.root,
+            len(plain),
+            len(seen),
+            stated,
+            frame.image_path,
+            _shown(look.color),
+            flag,
+            "" if same or not flag else " if that is the background of the others",
+        )
 
 
-def _name_of(color: np.ndarray) -> Background | None:
-    """Return the name of a known background, or None for any other colour."""
-    return next((name for name, known in BACKGROUNDS.items() if _is_close(color, np.array(known))), None)
+def _warn_of_missing_masks(subject: Subject) -> None:
+    """Log the training images that lack a mask where others have one."""
+    frames = subject.frames["train"]
+    missing = [frame for frame in frames if frame.mask_path is None]
+    if 0 < len(missing) < len(frames):
+        log.warning(
+            "%s: %d of %d training images have no mask, for example %s; the masks of the others are used, and these "
+            "keep their background",
+            subject.root,
+            len(missing),
+            len(frames),
+            missing[0].image_path,
+        )
+
+
+def _shown(color: np.ndarray) -> str:
+    return ", ".join(f"{value:.3g}" for value in color)
 
 
 def _is_close(a: np.ndarray, b: np.ndarray) -> bool:
-    return bool(np.abs(a - b).max() <= 0.1)
+    return bool(np.abs(a - b).max() <= _CLOSE)
 
 
 def _for_all(work: Callable[[int], None], count: int, threads: int) -> None:
@@ -166,58 +320,12 @@ def _common_size(frames: Sequence[Frame], size: tuple[int, int] | None) -> tuple
     return width, height
 
 
-def _read_image(frame: Frame) -> np.ndarray:
-    """Pixels of a frame's image, shape [H, W, 3], uint8."""
-    pixels = _decode(frame.image_path, frame)
-    channels = pixels.shape[2]
-    if channels == 4:
-        if pixels[..., 3].min() < 255:
-            raise DataError(f"{frame.image_path}: has transparent pixels; composite it on the capture's background")
-        pixels = pixels[..., :3]
-    return np.broadcast_to(pixels, (*pixels.shape[:2], 3)) if channels == 1 else pixels
-
-
 def _read_mask(frame: Frame) -> np.ndarray:
-    """Decode a frame's foreground alpha, shape [H, W, 1], uint8."""
+    """Decode a frame's foreground alpha, shape [H, W], uint8."""
     if frame.mask_path is None:
         raise DataError(f"{frame.image_path}: this frame has no foreground mask (fg_mask_path)")
-    return _decode(frame.mask_path, frame)[..., :1]
-
-
-def _decode(path: Path, frame: Frame) -> np.ndarray:
-    """Pixels of a file, shape [H, W, channels], uint8, if it is as large as the frame's camera says."""
-    camera = frame.camera
-    existing_file(path)
-    try:
-        with Image.open(path) as header:  # reads no pixels yet
-            fits = header.size == (camera.width, camera.height)
-            pixels = _pixels(path, header) if fits else np.empty((header.height, 0, 0))
-            found = header.size
-    except Exception as error:  # Pillow and kornia_rs raise bare exceptions of many kinds
-        raise DataError(f"{path}: not a readable image ({one_line(error) or type(error).__name__})") from error
-    if not fits:
-        raise DataError(
-            f"{path} is {found[0]}x{found[1]} but the capture's transforms file says {camera.width}x{camera.height}; "
-            "scale the images and w, h, fl_x, fl_y, cx, cy alike"
-        )
-    return pixels
-
-
-def _pixels(path: Path, image: Image.Image) -> np.ndarray:
-    """Decode with the fastest decoder that gets this kind of file right.
-
-    kornia_rs is three times as fast as Pillow for PNG, but returns the indices of palette images and takes no notice
-    of truncated JPEG files.
-    """
-    if image.format == "PNG" and image.mode in ("RGB", "RGBA", "L"):
-        pixels = kornia_rs.io.read_image(str(path))
-    else:
-        if image.mode not in ("RGB", "RGBA", "L") and not image.mode.startswith("I;16"):
-            image = image.convert("RGBA" if image.has_transparency_data else "L" if image.mode == "1" else "RGB")
-        pixels = np.asarray(image)
-    if pixels.dtype.itemsize == 2:
-        pixels = ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    return pixels.reshape(*pixels.shape[:2], -1)
+    size = (frame.camera.width, frame.camera.height)
+    return read_matte(frame.mask_path, size, alpha_only=frame.mask_path == frame.image_path)
 
 
 def _resampled(pixels: np.ndarray, width: int, height: int) -> np.ndarray:

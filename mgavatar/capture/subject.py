@@ -9,15 +9,11 @@ from typing import Literal
 import numpy as np
 
 from mgavatar.camera import Camera
-from mgavatar.config import Background
 from mgavatar.head.params import HeadParams
 
 Split = Literal["train", "val", "test"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-
-BACKGROUNDS: dict[Background, tuple[float, float, float]] = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-"""RGB in 0..1 of the backgrounds that captures are composited on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +21,13 @@ class Frame:
     """One image of a capture.
 
     Attributes:
-        image_path: The image, composited on ``Subject.background``.
-        mask_path: 8-bit foreground alpha, or None.
+        image_path: The image.
+        mask_path: Foreground alpha, or None: a mask, or an image with the matte in its alpha channel, which may be the
+            image itself.
         camera: Calibration at the size of the file.
         camera_id: Index of the camera in the capture.
         timestep: Row of ``Subject.params``.
+        background: Colour to show behind the subject, that of ``Subject.background``, RGB in 0..1.
     """
 
     image_path: Path
@@ -37,6 +35,7 @@ class Frame:
     camera: Camera
     camera_id: int
     timestep: int
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)

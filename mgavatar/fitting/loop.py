@@ -156,7 +156,7 @@ class Loop:
                     raise Interrupted(f"stopped in {stage.name} at {iteration}/{total}", avatar)
 
     def _step(self, stage: Stage, views: Views, view: int, iteration: int, schedule_step: float) -> dict[str, float]:
-        background = self._background(iteration) if views.masks is not None else self.background
+        background = self._background(iteration) if views.has_mask[view] else self.background
         target = views.target(view, self.background, background)
         terms = stage.step(views.cameras[view], views.timesteps[view], target, background, schedule_step)
         if not np.isfinite(terms["loss"]):

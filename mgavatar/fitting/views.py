@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from mgavatar.camera import Camera
@@ -19,15 +21,17 @@ class Views:
 
     Attributes:
         images: Shape [N, 3, H, W], uint8, on the CPU.
-        masks: Coverage, shape [N, H, W], uint8, or None where a view has none.
+        masks: Coverage, shape [N, H, W], uint8, or None if no view has a mask; all 255 for a view without one.
         cameras: N cameras at the size of ``images``.
         timesteps: N rows of the capture's parameters.
+        has_mask: True for each of the N views that can be put on another background.
     """
 
     images: Tensor
     masks: Tensor | None
     cameras: list[Camera]
     timesteps: list[int]
+    has_mask: list[bool]
 
     @staticmethod
     def of(subject: Subject, max_size: int, *, with_masks: bool) -> Views:
@@ -37,9 +41,15 @@ class Views:
         scale = min(1.0, max_size / max(first.width, first.height))
         size = (max(1, round(first.width * scale)), max(1, round(first.height * scale)))
         cameras = [frame.camera.scaled(*size) for frame in frames]
-        masked = with_masks and all(frame.mask_path is not None for frame in frames)
-        masks = read_masks(frames, size=size) if masked else None
-        return Views(read_images(frames, size=size), masks, cameras, [frame.timestep for frame in frames])
+        has_mask = [with_masks and frame.mask_path is not None for frame in frames]
+        masks = None
+        if any(has_mask):
+            masks = read_masks(list(compress(frames, has_mask)), size=size)
+        if masks is not None and not all(has_mask):
+            some, masks = masks, torch.full((len(frames), *masks.shape[1:]), 255, dtype=torch.uint8)
+            masks[torch.tensor(has_mask)] = some
+        timesteps = [frame.timestep for frame in frames]
+        return Views(read_images(frames, size=size), masks, cameras, timesteps, has_mask)
 
     def target(self, view: int, background: Tensor, new_background: Tensor) -> Tensor:
         """Return a training image with another background.

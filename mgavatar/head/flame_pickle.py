@@ -17,12 +17,14 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from mgavatar.errors import DataError
-from mgavatar.files import GIBIBYTE, one_line, read_bytes
+from mgavatar.files import GIBIBYTE, foreign_content, one_line, read_bytes
 
 MAX_DEPTH = 6
 """Largest depth of arrays in arrays (chumpy objects in chumpy objects); FLAME's files need 3."""
 MAX_DENSE = 50_000_000
 """Largest number of elements of a sparse matrix after it has been made dense."""
+ARCHIVES = {b"PK\x03\x04": "zip", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7z", b"Rar!": "rar"}
+"""Archives that FLAME's files are handed on in, by their first bytes."""
 PLAIN_TYPES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 
 
@@ -183,10 +185,64 @@ def read_flame_pickle(path: Path, *, keys: Collection[str] | None = None) -> dic
             "take the file from FLAME's own download, or save its arrays as .npz"
         ) from error
     except Exception as error:  # a damaged pickle can raise anything
-        raise DataError(f"{path}: not a readable pickle ({one_line(error) or type(error).__name__})") from error
+        raise DataError(f"{path}: not a readable pickle ({_what_it_is(path, data, error)})") from error
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a {one_line(type(content).__name__)}, FLAME's files hold a dictionary")
     return _arrays_of(content, path=path, keys=keys)
+
+
+def read_pickled_arrays(data: bytes, *, path: Path) -> dict[str, Any]:
+    """Read a pickled dictionary of arrays, numbers, text and further dictionaries, as trackers save their frames.
+
+    Args:
+        data: The pickle.
+        path: File that the messages name.
+
+    Returns:
+        The dictionary; keys are text, and what is neither an array, a number, text nor a dictionary is left out.
+
+    Raises:
+        DataError: If it is no such pickle, is damaged, or names anything but numpy's arrays.
+    """
+    try:
+        content = _InertUnpickler(io.BytesIO(data), encoding="latin1").load()
+    except _RefusedError as error:
+        raise DataError(
+            f"{path}: refused, because it asks for {one_line(error)}; only numpy's arrays are read"
+        ) from error
+    except Exception as error:  # a damaged pickle can raise anything
+        raise DataError(f"{path}: not a readable pickle ({one_line(error) or type(error).__name__})") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path}: holds a {one_line(type(content).__name__)}, a dictionary is needed")
+    return _tree(content, path=path, depth=0)
+
+
+def _tree(content: dict[Any, Any], *, path: Path, depth: int) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for key, value in content.items():
+        name = str(key)
+        if isinstance(value, dict) and depth < MAX_DEPTH:
+            tree[name] = _tree(value, path=path, depth=depth + 1)
+        elif isinstance(value, int | float | str):
+            tree[name] = value
+        elif isinstance(value, _Record | list):
+            try:
+                tree[name] = _array(value, depth=0)
+            except (ValueError, TypeError, OverflowError) as error:
+                raise DataError(f"{path}: {one_line(name, limit=40)} is damaged ({one_line(error)})") from error
+    return tree
+
+
+def _what_it_is(path: Path, data: bytes, error: Exception) -> str:
+    """Say what lies in the place of a pickle: what a download leaves, an archive, or what the unpickler says."""
+    if (foreign := foreign_content(path)) is not None:
+        return foreign
+    if data.startswith(b"\x93NUMPY"):
+        return "it is a .npy file of one array"
+    archive = next((name for start, name in ARCHIVES.items() if data.startswith(start)), None)
+    if archive is not None:
+        return f"it is a {archive} archive; unpack it and give the .pkl inside"
+    return one_line(error) or type(error).__name__
 
 
 def _arrays_of(content: dict[Any, Any], *, path: Path, keys: Collection[str] | None) -> dict[str, np.ndarray]:

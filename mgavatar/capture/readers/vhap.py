@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from mgavatar.camera import Camera
-from mgavatar.capture.subject import BACKGROUNDS, SPLITS, Frame, Split, Subject
-from mgavatar.capture.transforms import FrameReader, camera_of_frame
-from mgavatar.config import Background, PrincipalPoint
+from mgavatar.capture.pixels import has_alpha, image_size, read_matte
+from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
+from mgavatar.capture.transforms import FrameReader, LinkedFolders, camera_of_frame
+from mgavatar.config import PrincipalPoint
 from mgavatar.errors import DataError
 from mgavatar.files import float_array, one_line, read_json, read_npz
 from mgavatar.head.params import POSE_WIDTHS, HeadParams
@@ -20,6 +21,11 @@ from mgavatar.head.params import POSE_WIDTHS, HeadParams
 PARAM_WIDTHS: dict[str, int | None] = {"expr": None, **POSE_WIDTHS}
 
 MAX_PARAM_BYTES = 64 << 20
+
+OTHER_PERSON_RMS, OTHER_PERSON_RELATIVE = 0.3, 0.9
+"""Difference of two identities, per coefficient and relative to the longer of them, above which they are two people.
+
+Coefficients are in standard deviations: two strangers with coefficients of length L differ by about 1.4 L."""
 
 MARK = "transforms_train.json"
 
@@ -31,21 +37,73 @@ def recognises(root: Path) -> bool:
     return (root / MARK).exists()
 
 
-def read(root: Path, *, background: Background, principal_point: PrincipalPoint) -> Subject:
+def read(
+    root: Path,
+    *,
+    background: tuple[float, float, float],
+    principal_point: PrincipalPoint,
+    skip_bad: bool,
+    follow_links: bool,
+) -> Subject:
     """Read a capture in this layout; arguments, result and errors are those of ``read_capture``."""
-    entries = {split: list(_split_entries(root, split, principal_point)) for split in SPLITS}
+    links = LinkedFolders(root.parent, follow_all=follow_links)
+    failures = _Failures(root, skip=skip_bad)
+    entries = {split: list(_split_entries(root, split, principal_point, links, failures)) for split in SPLITS}
+    failures.settle(sum(len(own) for own in entries.values()), "frames")
+    for link, target in links.followed.items():
+        log.info("%s: is a link to %s, which is followed", link, target)
     _check_duplicates(entries, root)
+    _warn_of_off_centre(entries, root, principal_point)
     params_of = _params_of_timesteps(entries, root)
-    timesteps = sorted(params_of)
+    params, timesteps = _read_params(params_of, failures)
     row_of = {timestep: row for row, timestep in enumerate(timesteps)}
+    kept = {split: [entry for entry in own if entry.timestep_id in row_of] for split, own in entries.items()}
+    if not kept["train"]:
+        raise DataError(f"{root / MARK}: no training frame can be used")
+    mattes = _images_with_mattes(kept)
     return Subject(
         root=root,
-        frames={split: tuple(entry.frame(row_of) for entry in entries[split]) for split in SPLITS},
-        params=_read_params([params_of[timestep] for timestep in timesteps]),
+        frames={split: tuple(entry.frame(row_of, background, mattes) for entry in kept[split]) for split in SPLITS},
+        params=params,
         timestep_ids=tuple(timesteps),
-        background=np.array(BACKGROUNDS[background], np.float32),
+        background=np.array(background, np.float32),
         ground_truth=next(iter(sorted((root / "ground_truth").glob("*.npz"))), None),
     )
+
+
+@dataclass
+class _Failures:
+    """Frames or timesteps that cannot be used.
+
+    Attributes:
+        root: The capture.
+        skip: Leave them out instead of refusing the capture.
+        found: What is wrong, by their names.
+    """
+
+    root: Path
+    skip: bool
+    found: dict[str, DataError] = field(default_factory=dict)
+
+    def settle(self, n_good: int, kind: str) -> None:
+        """Log what is left out, or refuse the capture because of the first failure.
+
+        Args:
+            n_good: Number of those without a failure.
+            kind: Word for them in messages.
+        """
+        if not self.found:
+            return
+        first = next(iter(self.found.values()))
+        if not self.skip or not n_good:
+            # Where most fail, the capture is to blame and not a frame of it.
+            hint = "; --skip-bad leaves such frames out" if len(self.found) <= n_good and not self.skip else ""
+            raise DataError(f"{first}{hint}")
+        names = ", ".join(list(self.found)[:3]) + (", …" if len(self.found) > 3 else "")
+        log.warning(
+            "%s: %d %s are left out: %s; the first because of %s", self.root, len(self.found), kind, names, first
+        )
+        self.found.clear()
 
 
 @dataclass(frozen=True)
@@ -60,12 +118,23 @@ class _Entry:
     camera: Camera
     camera_id: int
     timestep_id: int
+    is_off_centre: bool
 
-    def frame(self, row_of: dict[int, int]) -> Frame:
-        return Frame(self.image_path, self.mask_path, self.camera, self.camera_id, row_of[self.timestep_id])
+    def frame(self, row_of: dict[int, int], background: tuple[float, float, float], mattes: frozenset[Path]) -> Frame:
+        own_matte = self.image_path if self.image_path in mattes else None
+        return Frame(
+            image_path=self.image_path,
+            mask_path=self.mask_path or own_matte,
+            camera=self.camera,
+            camera_id=self.camera_id,
+            timestep=row_of[self.timestep_id],
+            background=background,
+        )
 
 
-def _split_entries(root: Path, split: Split, principal_point: PrincipalPoint) -> Iterator[_Entry]:
+def _split_entries(
+    root: Path, split: Split, principal_point: PrincipalPoint, links: LinkedFolders, failures: _Failures
+) -> Iterator[_Entry]:
     path = root / f"transforms_{split}.json"
     if split != "train" and not path.exists():
         return
@@ -73,20 +142,14 @@ def _split_entries(root: Path, split: Split, principal_point: PrincipalPoint) ->
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or (split == "train" and not frames):
         raise DataError(f"{path}: no list of frames; it must be {{'frames': [...]}} as VHAP writes it")
-    off_centre = 0
     for index, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise DataError(f"{path}: frame {index} is no object")
-        reader = FrameReader(path, meta, frame, one_line(frame.get("file_path") or index, limit=80))
-        off_centre += _is_off_centre(reader)
-        yield _entry(reader, split=split, principal_point=principal_point)
-    if off_centre and principal_point == "center":
-        log.warning(
-            "%s: the principal point of %d frames is more than 1 %% off the image centre; it is put into the centre, "
-            "as GaussianAvatars does; --principal-point opencv or opengl takes it from the file",
-            path,
-            off_centre,
-        )
+        reader = FrameReader(path, meta, frame, one_line(frame.get("file_path") or index, limit=80), links=links)
+        try:
+            yield _entry(reader, split=split, principal_point=principal_point)
+        except DataError as error:
+            failures.found[f"{split} {reader.label}"] = error
 
 
 def _entry(reader: FrameReader, *, split: Split, principal_point: PrincipalPoint) -> _Entry:
@@ -94,23 +157,54 @@ def _entry(reader: FrameReader, *, split: Split, principal_point: PrincipalPoint
         raise DataError(f"{reader.where} has no file_path")
     if reader.values.get("flame_param_path") is None:
         raise DataError(f"{reader.where} has no flame_param_path; export the capture with its tracked parameters")
+    image_path = reader.image("file_path")
+    # As in captures for NeRF, whose readers take the size from the images.
+    size = None if reader.has("w") and reader.has("h") else image_size(image_path)
+    camera = camera_of_frame(reader, principal_point, size=size)
     return _Entry(
         split=split,
         label=reader.label,
-        image_path=reader.file("file_path"),
-        mask_path=reader.file("fg_mask_path") if reader.values.get("fg_mask_path") else None,
+        image_path=image_path,
+        mask_path=reader.image("fg_mask_path") if reader.values.get("fg_mask_path") else None,
         params_path=reader.file("flame_param_path"),
-        camera=camera_of_frame(reader, principal_point),
-        camera_id=reader.whole("camera_index", low=0) if "camera_index" in reader.values else 0,
+        camera=camera,
+        camera_id=reader.whole("camera_index", low=0) if reader.has("camera_index") else 0,
         timestep_id=reader.whole("timestep_index", low=0),
+        is_off_centre=_is_off_centre(reader, camera),
     )
 
 
-def _is_off_centre(reader: FrameReader) -> bool:
-    if not all(reader.has(key) for key in ("cx", "cy", "w", "h")):
+def _is_off_centre(reader: FrameReader, camera: Camera) -> bool:
+    if not (reader.has("cx") and reader.has("cy")):
         return False
-    cx, cy, width, height = (reader.number(key) for key in ("cx", "cy", "w", "h"))
-    return max(abs(cx - width / 2), abs(cy - height / 2)) > 0.01 * width
+    away = max(abs(reader.number("cx") - camera.width / 2), abs(reader.number("cy") - camera.height / 2))
+    return away > 0.01 * camera.width
+
+
+def _warn_of_off_centre(entries: dict[Split, list[_Entry]], root: Path, principal_point: PrincipalPoint) -> None:
+    for split, own in entries.items():
+        count = sum(entry.is_off_centre for entry in own)
+        if count and principal_point == "center":
+            log.warning(
+                "%s: the principal point of %d frames is more than 1 %% off the image centre; it is put into the "
+                "centre, as GaussianAvatars does; --principal-point opencv or opengl takes it from the file",
+                root / f"transforms_{split}.json",
+                count,
+            )
+
+
+def _images_with_mattes(entries: dict[Split, list[_Entry]]) -> frozenset[Path]:
+    """Return the images without a mask whose alpha channel has a matte.
+
+    Some programs write an opaque alpha channel into every image: the first one that has the channel tells.
+    """
+    bare = {entry.image_path: entry.camera for own in entries.values() for entry in own if entry.mask_path is None}
+    candidates = [path for path in bare if has_alpha(path)]
+    if not candidates:
+        return frozenset()
+    camera = bare[candidates[0]]
+    matte = read_matte(candidates[0], (camera.width, camera.height), alpha_only=True)
+    return frozenset(candidates if matte.min() < 255 else ())
 
 
 def _check_duplicates(entries: dict[Split, list[_Entry]], root: Path) -> None:
@@ -144,23 +238,74 @@ def _params_of_timesteps(entries: dict[Split, list[_Entry]], root: Path) -> dict
     return params_of
 
 
-def _read_params(paths: list[Path]) -> HeadParams:
-    """Parameters of all timesteps; widths and identity must agree, the offset is that of the first one."""
-    wanted = {*PARAM_WIDTHS, "shape"}
-    first = read_npz(paths[0], wanted=lambda key: key in wanted | {"static_offset"}, max_bytes=MAX_PARAM_BYTES).arrays
-    shape = _row(first, "shape", None, path=paths[0])
-    rows: dict[str, list[np.ndarray]] = {key: [] for key in PARAM_WIDTHS}
-    for path in paths:
-        arrays = read_npz(path, wanted=lambda key: key in wanted, max_bytes=MAX_PARAM_BYTES).arrays
-        for key, width in PARAM_WIDTHS.items():
-            rows[key].append(_row(arrays, key, width, path=path))
-        _check_agrees(rows["expr"][0], rows["expr"][-1], "expr", path, paths[0])
-        own_shape = _row(arrays, "shape", None, path=path)
-        _check_agrees(shape, own_shape, "shape", path, paths[0])
-        if not np.allclose(shape, own_shape, rtol=1e-3, atol=1e-4):
-            raise DataError(f"{path}: shape differs from that of {paths[0]}; one subject has one identity")
-    stacked = {key: np.stack(values) for key, values in rows.items()}
-    return HeadParams(shape=shape, static_offset=_static_offset(first, path=paths[0]), **stacked)
+def _read_params(params_of: dict[int, Path], failures: _Failures) -> tuple[HeadParams, list[int]]:
+    """Read the parameters of all timesteps, and return them with the timesteps that could be read.
+
+    Numbers of coefficients must agree. Identity and offset are those of the first timestep: sequences that were
+    tracked one by one differ a little, and GaussianAvatars takes the first of them too.
+    """
+    read: dict[int, _Params] = {}
+    for timestep in sorted(params_of):
+        path = params_of[timestep]
+        try:
+            own = _params_of(path)
+            first = next(iter(read.values()), own)
+            for key in ("expr", "shape"):
+                _check_agrees(first.rows[key], own.rows[key], key, path, first.path)
+        except DataError as error:
+            failures.found[f"timestep {timestep}"] = error
+        else:
+            read[timestep] = own
+    failures.settle(len(read), "timesteps")
+    first = next(iter(read.values()))
+    _check_identities(list(read.values()))
+    stacked = {key: np.stack([own.rows[key] for own in read.values()]) for key in PARAM_WIDTHS}
+    offset = read_npz(first.path, wanted=lambda key: key == "static_offset", max_bytes=MAX_PARAM_BYTES).arrays
+    params = HeadParams(shape=first.rows["shape"], static_offset=_static_offset(offset, path=first.path), **stacked)
+    return params, list(read)
+
+
+@dataclass(frozen=True)
+class _Params:
+    """Parameters of one timestep, flat, and their file."""
+
+    path: Path
+    rows: dict[str, np.ndarray]
+
+
+def _params_of(path: Path) -> _Params:
+    widths = {"shape": None, **PARAM_WIDTHS}
+    arrays = read_npz(path, wanted=lambda key: key in widths, max_bytes=MAX_PARAM_BYTES).arrays
+    return _Params(path, {key: _row(arrays, key, width, path=path) for key, width in widths.items()})
+
+
+def _check_identities(params: list[_Params]) -> None:
+    """Say how much the identities of sequences differ; refuse those of two people."""
+    shapes = np.stack([own.rows["shape"] for own in params]).astype(np.float64)
+    if not shapes.size:
+        return
+    away = shapes - shapes[0]
+    worst = int(np.argmax((away**2).sum(1)))
+    rms = float(np.sqrt((away[worst] ** 2).mean()))
+    relative = float(np.linalg.norm(away[worst])) / max(*np.linalg.norm(shapes[[0, worst]], axis=1), 1e-12)
+    if np.allclose(shapes[0], shapes[worst], rtol=1e-3, atol=1e-4):
+        return
+    size = f"by {rms:.2g} rms per coefficient, {100.0 * relative:.0f} % of its length"
+    if rms > OTHER_PERSON_RMS and relative > OTHER_PERSON_RELATIVE:
+        raise DataError(
+            f"{params[worst].path}: shape differs from that of {params[0].path} {size}: these are two people; one "
+            "subject has one identity"
+        )
+    differing = int((np.abs(away).max(axis=1) > 1e-4).sum())
+    log.warning(
+        "%s: shape of %d of %d timesteps differs from that of the first, %s, up to %s; as in sequences that were "
+        "tracked one by one. The first is used for all, as GaussianAvatars does",
+        params[0].path.parent.parent,
+        differing,
+        len(params),
+        params[0].path,
+        size,
+    )
 
 
 def _row(arrays: dict[str, np.ndarray], key: str, width: int | None, *, path: Path) -> np.ndarray:
