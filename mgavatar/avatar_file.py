@@ -20,6 +20,7 @@ from mgavatar.config import ResolvedConfig, from_dict
 from mgavatar.errors import DataError
 from mgavatar.files import atomic_write, existing_file, one_line
 from mgavatar.geometry.head import PersonalHead
+from mgavatar.geometry.refine_net import N_POSE
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
 from mgavatar.head.body import Body
 from mgavatar.head.load import head_arrays, head_from_arrays
@@ -93,7 +94,7 @@ def read_avatar(path: Path, *, device: torch.device | str = "cpu") -> AvatarPart
         subdivisions = config.geometry.subdivisions
         body = Body(head_from_arrays(arrays, path=path), subdivisions=subdivisions, device=device)
         capture = _capture_of(payload["capture"])
-        head = PersonalHead(body, capture.tracked, config.geometry)
+        head = PersonalHead(body, capture.tracked, config.geometry, train_rows=capture.train_timesteps)
         vertex_gaussians = VertexGaussians(head, config)
         _load_state(vertex_gaussians, payload["geometry"])
         appearance = None
@@ -135,6 +136,9 @@ def _from_format_2(payload: dict[str, Any]) -> dict[str, Any]:
     for stage in ("geometry", "appearance"):
         table = payload["config"][stage]
         table["lr_final_factor"] = table.pop("final_lr")
+    # Pose offsets were those of Eq. 2 itself, with all that poses have in common in them.
+    payload["config"]["geometry"]["center_pose_offsets"] = False
+    payload["geometry"]["head.refine.mean_pose"] = torch.zeros(N_POSE)
     for name in ("neck", "jaw", "eyes"):
         payload["geometry"][f"head.poses.{name}_pose"] = payload["geometry"].pop(f"head.poses.{name}")
     return payload | {"format": "mgavatar/3"}

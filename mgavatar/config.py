@@ -134,6 +134,8 @@ class GeometryConfig:
     """Learn Phi_id (Eq. 1)."""
     pose_offsets: bool | Literal["auto"] = True
     """Learn Phi_pose (Eq. 2). auto: where neck, jaw or eyes move."""
+    center_pose_offsets: bool = True
+    """Subtract Phi_pose's output at the capture's mean pose, so that all that is the same in all poses is identity."""
     learn_jaw: bool | Literal["auto"] = True
     """Refine the jaw's rotations, in appearance.head_tuning too. auto: where the jaw moves."""
     learn_eyes: bool | Literal["auto"] = True

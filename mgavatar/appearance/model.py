@@ -167,7 +167,7 @@ class Appearance(nn.Module):
             self._by_face = gather_matrix(self.gaussians.face_ids, self.gaussians.n_faces)
         return self._by_face
 
-    def _offsets(self, posed: PosedMesh) -> tuple[Tensor, Tensor] | None:
+    def offsets(self, posed: PosedMesh) -> tuple[Tensor, Tensor] | None:
         """``O_map`` [13, H, W], and what each Gaussian reads there [N, 13]."""
         if self.offset_net is None:
             return None
@@ -197,7 +197,7 @@ class Appearance(nn.Module):
             OffsetNet.
         """
         g = self.gaussians
-        offsets = self._offsets(posed)
+        offsets = self.offsets(posed)
         means, quats, scales, opacities, more_colors = bind_to_faces(
             posed.frames.all,
             g.face_ids,

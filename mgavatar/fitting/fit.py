@@ -120,7 +120,7 @@ def fit_geometry(
     with init:
         # Eq. 1, canonical positions, and Eq. 2, pose offsets: RefineNet (geometry/refine_net.py).
         # Eq. 3, animated positions: both offsets, then blend skinning (geometry/head.py).
-        head = PersonalHead(body, subject.params, config.geometry)
+        head = PersonalHead(body, subject.params, config.geometry, train_rows=CaptureInfo.of(subject).train_timesteps)
         # One Gaussian per vertex with reduced freedom (geometry/vertex_gaussians.py).
         vertex_gaussians = VertexGaussians(head, config)
     if config.geometry.enabled:

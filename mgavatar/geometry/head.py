@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,22 @@ class PosedHead:
 class PersonalHead(nn.Module):
     """Learnable identity beta, offset networks, and pose, expression and translation of every timestep."""
 
-    def __init__(self, body: Body, params: HeadParams, config: ResolvedGeometryConfig) -> None:
+    def __init__(
+        self,
+        body: Body,
+        params: HeadParams,
+        config: ResolvedGeometryConfig,
+        *,
+        train_rows: Sequence[int] | None = None,
+    ) -> None:
+        """Start as tracked.
+
+        Args:
+            body: The subdivided head model.
+            params: Tracked parameters of all timesteps.
+            config: Configuration of the geometry stage.
+            train_rows: Timesteps whose mean pose has no pose offsets; all if None.
+        """
         super().__init__()
         self.body = body
         device = body.device
@@ -66,7 +82,8 @@ class PersonalHead(nn.Module):
         self.tracked_joints: Tensor
         with torch.no_grad():
             self.register_buffer("tracked_joints", body.joints(self._tracked_shape(params)), persistent=False)
-        self.refine = RefineNet(torch.tensor(body.fine.v_template), config).to(device)
+        mean_pose = mean_joint_pose(params, rows=train_rows)
+        self.refine = RefineNet(torch.tensor(body.fine.v_template), config, mean_pose=mean_pose).to(device)
 
     def learn_poses(self) -> None:
         """Let the parameters of all timesteps learn; jaw and eyes only if ``learn_jaw`` and ``learn_eyes`` are set."""
@@ -112,6 +129,13 @@ class PersonalHead(nn.Module):
     def canonical(self) -> Tensor:
         """Return the neutral personal head ``mu_c`` of Eq. 1 [m], shape [V, 3]."""
         return self.shaped() + self.refine.identity_offsets(self.refine.encode())
+
+
+def mean_joint_pose(params: HeadParams, *, rows: Sequence[int] | None) -> Tensor:
+    """Return the mean rotation vectors of neck, jaw and eyes [rad] over some frames, or over all, shape [12]."""
+    poses = np.concatenate([params.neck_pose, params.jaw_pose, params.eyes_pose], axis=1)
+    chosen = poses if rows is None else poses[list(rows)]
+    return torch.from_numpy(chosen.mean(axis=0).astype(np.float32))
 
 
 def _base_offsets(static_offset: np.ndarray | None, n_verts: int) -> np.ndarray | None:

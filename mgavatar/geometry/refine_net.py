@@ -33,14 +33,23 @@ class RefineNet(nn.Module):
     Vertices keep their place in the triplane, so sampling it is a fixed matrix.
     """
 
-    def __init__(self, v_template: Tensor, config: ResolvedGeometryConfig) -> None:
-        """Encode the vertices of the fine template, shape [V, 3]."""
+    def __init__(self, v_template: Tensor, config: ResolvedGeometryConfig, *, mean_pose: Tensor) -> None:
+        """Start at the template.
+
+        Args:
+            v_template: Vertices of the fine template [m], shape [V, 3].
+            config: Sizes, and the offsets that are learned.
+            mean_pose: Neck, jaw and eye rotations [rad] at which the pose offsets are zero, shape [12].
+        """
         super().__init__()
         resolution, channels = config.triplane_resolution, config.triplane_channels
         self.unit = config.offset_unit
         self.planes = nn.Parameter(0.1 * torch.randn(3, resolution**2, channels))
         self.phi_id = _mlp(3 * channels, config.hidden) if config.identity_offsets else None
         self.phi_pose = _mlp(3 * channels + N_POSE, config.hidden) if config.pose_offsets else None
+        self.centered = config.center_pose_offsets
+        self.mean_pose: Tensor
+        self.register_buffer("mean_pose", mean_pose.clone())
         low, high = v_template.min(0).values, v_template.max(0).values
         place = ((v_template - low) / (high - low).max()).cpu()
         pairs = ((0, 1), (1, 2), (2, 0))
@@ -70,17 +79,27 @@ class RefineNet(nn.Module):
         return self.unit * mlp(features, weights, biases)
 
     def pose_offsets(self, features: Tensor, pose: Tensor) -> Tensor:
-        """Compute the pose offsets ``delta mu_pose`` of Eq. 2 [m], shape [V, 3]; zero if switched off.
+        """Return ``delta mu_pose`` of Eq. 2 [m], shape [V, 3]; zero if switched off.
+
+        Its value at the mean pose is subtracted: without that, Phi_pose becomes a second identity network, and the
+        canonical head of Eq. 1 is nobody's.
 
         Args:
-            features: Triplane features, shape [V, 3 channels].
-            pose: Rotation vectors of neck, jaw and both eyes [rad], shape [12].
+            features: Triplane features of the vertices, shape [V, 3 channels].
+            pose: Neck, jaw and eye rotations [rad], shape [12].
         """
         if self.phi_pose is None:
             return torch.zeros(len(features), 3, device=features.device)
+        offsets = self._phi_pose(features, pose)
+        if self.centered:
+            offsets = offsets - self._phi_pose(features, self.mean_pose)
+        return self.unit * offsets
+
+    def _phi_pose(self, features: Tensor, pose: Tensor) -> Tensor:
+        assert self.phi_pose is not None  # noqa: S101  for the type checker
         weights, biases = linear_layers(self.phi_pose)
         n = features.shape[1]
         # The pose is the same for all vertices: its share of the first layer is one vector.
         biases[0] = biases[0] + weights[0][:, n:] @ pose
         weights[0] = weights[0][:, :n]
-        return self.unit * mlp(features, weights, biases)
+        return mlp(features, weights, biases)
