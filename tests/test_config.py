@@ -106,7 +106,7 @@ def test_the_paper_preset_changes_nothing():
 
 def test_the_offset_networks_have_the_papers_layers():
     """Phi_id and Phi_pose: four layers, 128 channels; three planes."""
-    net = RefineNet(torch.rand(5, 3), GeometryConfig())
+    net = RefineNet(torch.rand(5, 3), GeometryConfig(), mean_pose=torch.zeros(12))
     assert len(net.planes) == 3
     for mlp in (net.phi_id, net.phi_pose):
         layers = [layer for layer in mlp if isinstance(layer, nn.Linear)]

@@ -9,17 +9,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from tiny import WHITE, run, tiny_config, tiny_personal_head
+from tiny import WHITE, run, tiny_config, tiny_head, tiny_personal_head
 
 from mgavatar.avatar import Avatar
 from mgavatar.capture.info import CaptureInfo
 from mgavatar.capture.subject import Subject
 from mgavatar.config import FitConfig
 from mgavatar.gaussians import SH_C0
-from mgavatar.geometry.head import PosedHead
+from mgavatar.geometry.head import PersonalHead, PosedHead
 from mgavatar.geometry.refine_net import N_POSE, RefineNet
 from mgavatar.geometry.stage import GeometryStage, laplacian_loss, offset_loss
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
+from mgavatar.head.body import Body
 from mgavatar.kernels.laplacian import laplacian_matrix
 from mgavatar.losses import image_loss
 
@@ -75,7 +76,7 @@ def test_the_triplane_is_read_bilinearly():
     """Features are those of torch's own sampler on three planes over the bounding box (Eq. 1)."""
     torch.manual_seed(1)
     verts = torch.rand(40, 3) * torch.tensor([0.2, 0.3, 0.1])
-    net = RefineNet(verts, tiny_config().geometry)
+    net = RefineNet(verts, tiny_config().geometry, mean_pose=torch.zeros(N_POSE))
     features = net.encode()
     low, high = verts.min(0).values, verts.max(0).values
     place = (verts - low) / (high - low).max()
@@ -92,11 +93,15 @@ def test_pose_offsets_are_the_network_of_features_and_pose():
     """Eq. 2: splitting the first layer into a vertex's and the pose's share changes nothing."""
     torch.manual_seed(2)
     config = tiny_config().geometry
-    net = RefineNet(torch.rand(30, 3), config)
+    pose, mean_pose = torch.randn(2, N_POSE)
+    net = RefineNet(torch.rand(30, 3), config, mean_pose=mean_pose)
     torch.nn.init.normal_(net.phi_pose[-1].weight)
-    features, pose = net.encode(), torch.randn(N_POSE)
-    plain = net.phi_pose(torch.cat([features, pose.expand(30, N_POSE)], 1))
-    assert plain.abs().max() > 0.1
+    features = net.encode()
+    plain, at_mean = (net.phi_pose(torch.cat([features, p.expand(30, N_POSE)], 1)) for p in (pose, mean_pose))
+    assert (plain - at_mean).abs().max() > 0.1
+    assert torch.allclose(net.pose_offsets(features, pose), config.offset_unit * (plain - at_mean), atol=1e-7)
+    assert not net.pose_offsets(features, mean_pose).any()
+    net.centered = False
     assert torch.allclose(net.pose_offsets(features, pose), config.offset_unit * plain, atol=1e-7)
 
 
@@ -104,7 +109,7 @@ def test_identity_offsets_are_the_network_of_features():
     """Eq. 1 in units of ``offset_unit``."""
     torch.manual_seed(3)
     config = tiny_config(geometry={"offset_unit": 0.02}).geometry
-    net = RefineNet(torch.rand(30, 3), config)
+    net = RefineNet(torch.rand(30, 3), config, mean_pose=torch.zeros(N_POSE))
     torch.nn.init.normal_(net.phi_id[-1].weight)
     features = net.encode()
     assert features.std().item() == pytest.approx(0.1, rel=0.5)
@@ -129,12 +134,24 @@ def test_pose_offsets_are_given_neck_jaw_and_eyes(subject, monkeypatch):
     assert torch.equal(given[0], values)
 
 
+def test_the_mean_pose_is_that_of_the_training_timesteps(subject):
+    """What all training poses have in common is identity, whatever held-out timesteps do; it stays in the state."""
+    config = tiny_config()
+    rows = sorted({frame.timestep for frame in subject.frames["train"]})
+    head = PersonalHead(Body(tiny_head(), subdivisions=1), subject.params, config.geometry, train_rows=rows)
+    p = subject.params
+    expected = np.concatenate([p.neck_pose, p.jaw_pose, p.eyes_pose], axis=1)[rows].mean(axis=0)
+    assert np.allclose(head.refine.mean_pose.numpy(), expected, atol=1e-7)
+    assert len(rows) < len(p)
+    assert "refine.mean_pose" in head.state_dict()
+
+
 def test_offsets_add_up_before_posing(subject):
     """Eq. 3: the posed head is the parametric one plus both offsets, on joints that only identity moves."""
     head = make_stage(subject, tiny_config()).gaussians.head
     torch.nn.init.normal_(head.refine.phi_id[-1].weight)
     torch.nn.init.normal_(head.refine.phi_pose[-1].weight)
-    pose = head.pose(1)
+    pose = replace(head.pose(1), jaw_pose=torch.tensor([0.3, 0.0, 0.0]))
     posed = head.posed(pose)
     assert posed.identity_offsets.abs().max() > 1e-4
     assert posed.pose_offsets.abs().max() > 1e-4
@@ -403,7 +420,8 @@ def test_gradients_reach_everything_that_is_learned(subject, views):
     for name, parameter in stage.gaussians.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
-        assert parameter.grad.any(), name
+        # A constant of Phi_pose is the same in all poses: centred offsets do not have it.
+        assert parameter.grad.any() != (name == "head.refine.phi_pose.6.bias"), name
     in_optimizer = {id(p) for group in stage.optimizer.param_groups for p in group["params"]}
     assert in_optimizer == {id(p) for p in stage.gaussians.parameters()}
 
