@@ -234,7 +234,7 @@ def test_offsets_are_read_where_the_gaussian_sits_in_the_atlas(subject):
             return maps
 
     appearance.offset_net = Maps()
-    _, offsets = appearance._offsets(frozen.at_timestep(0))
+    _, offsets = appearance.offsets(frozen.at_timestep(0))
     inside = ((centres > 1 / 64) & (centres < 1 - 1 / 64)).all(1)
     assert torch.allclose(offsets[inside, :2], centres[inside], atol=1e-5)
 

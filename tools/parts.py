@@ -99,26 +99,21 @@ def parts(avatar: Path, json: Path | None = None) -> str:
         json: Also write the numbers to this file.
     """
     loaded = Avatar.load(avatar)
-    found = {
-        "offsets": offset_parts(loaded),
-        "offset_net": offset_net_parts(loaded),
-        "binding": binding_parts(loaded),
-    }
+    offsets, offset_net, binding = offset_parts(loaded), offset_net_parts(loaded), binding_parts(loaded)
     if json is not None:
-        write_json(json, found)
-    offsets = found["offsets"]
+        write_json(json, {"offsets": offsets, "offset_net": offset_net, "binding": binding})
     rows = [
         ["identity offsets, mean length", f"{offsets['identity_mm']:.2f} mm"],
         ["pose offsets, mean length", f"{offsets['pose_mm']:.2f} mm"],
-        ["of these the same in all poses", f"{offsets['pose_constant_mm']:.2f} mm"],
-        ["share of the pose offsets' energy that depends on the pose", f"{100 * offsets['pose_share']:.1f} %"],
+        ["pose offsets that are the same in all poses", f"{offsets['pose_constant_mm']:.2f} mm"],
+        ["pose offsets, energy that depends on the pose", f"{100 * offsets['pose_share']:.1f} %"],
     ]
-    for name, part in (found["offset_net"] or {}).items():
+    for name, part in (offset_net or {}).items():
         text = f"{part['constant']:.4f} constant, {part['varying']:.4f} varying ({100 * part['share']:.1f} %)"
         rows.append([f"OffsetNet, {name}", text])
-    if found["binding"] is not None:
-        rows.append(["drawn Gaussians beyond epsilon_mu", f"{100 * found['binding']['beyond_position']:.1f} %"])
-        rows.append(["drawn Gaussians beyond epsilon_s + 0.1", f"{100 * found['binding']['beyond_scale']:.1f} %"])
+    if binding is not None:
+        rows.append(["drawn Gaussians beyond epsilon_mu", f"{100 * binding['beyond_position']:.1f} %"])
+        rows.append(["drawn Gaussians beyond epsilon_s + 0.1", f"{100 * binding['beyond_scale']:.1f} %"])
     return markdown_table(["part", "over the training poses"], rows)
 
 
