@@ -168,7 +168,7 @@ class Appearance(nn.Module):
         return self._by_face
 
     def offsets(self, posed: PosedMesh) -> tuple[Tensor, Tensor] | None:
-        """Return ``O_map`` of Eq. 10, [13, H, W], and the row of it that each Gaussian reads, [N, 13]; None without it."""
+        """Return ``O_map`` of Eq. 10, [13, H, W], and the row of it that each Gaussian reads, [N, 13]."""
         if self.offset_net is None:
             return None
         maps = self.offset_net(self.frozen.canonical_map, posed.pose_map, posed.theta)
