@@ -511,7 +511,8 @@ def main() -> None:
     logger.addHandler(handler)
     try:
         _run(sys.argv[1:])
-        sys.stdout.flush()
+        if sys.stdout is not None:  # there is none under pythonw
+            sys.stdout.flush()
     except DataError as error:
         _say(str(error))
         raise SystemExit(1) from None
