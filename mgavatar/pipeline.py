@@ -24,6 +24,7 @@ from mgavatar.fitting.fit import fit_avatar
 from mgavatar.fitting.loop import Interrupted
 from mgavatar.fitting.run import Run, open_run
 from mgavatar.head.model import HeadModel
+from mgavatar.presets import preset
 from mgavatar.progress import FitProgress
 from mgavatar.reporting.page import write_report
 from mgavatar.scoring.evaluate import evaluate_sample
@@ -80,7 +81,7 @@ def fit(
 
     Args:
         subject: The capture, from :func:`mgavatar.read_capture`.
-        head_model: Head model that the capture was tracked with, from :func:`mgavatar.read_head_model`.
+        head_model: Head model that the capture was tracked with, from :func:`mgavatar.load_head_model`.
         config: Configuration, from :func:`mgavatar.preset`; the preset ``quick`` by default.
         out: Folder for the avatar, its report and checkpoints, or the path of the avatar, ending in ``.pt``, whose
             other files go to the folder of the same name. Nothing is written if None.
@@ -101,8 +102,6 @@ def fit(
     if isinstance(budget, str):
         budget = Budget(parse_budget(budget))
     if config is None:
-        from mgavatar.presets import preset
-
         config = preset("quick")
     check(config)
     check_seed(seed)
