@@ -318,7 +318,7 @@ def test_a_budget_too_small_for_this_machine_leaves_nothing(subject, tmp_path, m
     timed = Timed(monkeypatch, 3.0)
     with pytest.raises(TooShort, match="give at least"):
         fit_into(tmp_path / "run", subject, timed, 30.0, tiny_config())
-    assert list((tmp_path / "run").iterdir()) == []
+    assert not (tmp_path / "run").exists()
     open_run(tmp_path / "run", resume=False)
 
 

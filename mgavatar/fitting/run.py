@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Sequence
@@ -124,6 +125,8 @@ def discard_run(run: Run | None) -> None:
     if run is not None:
         for path in (run.folder / "config.toml", run.metrics, run.checkpoint):
             path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # something else is in it
+            run.folder.rmdir()
 
 
 def iterations_done(checkpoint: dict[str, Any] | None, stage: Stage) -> int:
