@@ -17,7 +17,7 @@ VERBS = frozenset(
     Accumulate Adapt Add Advance Align Allocate Allow Announce Append Apply Arrange Ask Assemble Assign Average
     Bake Benchmark Bind Blend Bound Build
     Cache Calibrate Call Carry Cast Check Chart Choose Clamp Classify Clear Clip Clone Close Collect Combine Compare
-    Compile Complete Composite Compute Configure Convert Convolve Copy Count Create Crop Cut
+    Compile Complete Composite Compute Configure Continue Convert Convolve Copy Count Create Crop Cut
     Decay Decide Decode Decorate Delete Densify Derive Describe Detach Detect Display Divide Draw Drive Drop
     Embed Encode End Ensure Estimate Evaluate Exclude Exit Expand Export Express Extend Extract
     Fetch Fill Filter Find Finish Fit Flatten Flush Forget Format Freeze
