@@ -122,8 +122,8 @@ def fit(
         seed: Seed of all random draws; a fit repeats bit for bit on one machine.
         resume: Continue the fit in --out.
         budget: Time after which the avatar is written, such as 90s, 5m or 1h, counted from now.
-        skip_bad: Leave out, and name, frames with NaN or bad files.
-        follow_links: Follow links of single files out of the capture.
+        skip_bad: Leave out frames with NaN or bad files.
+        follow_links: Follow links of single files too.
         config: Every number of the method.
     """
     # The clock starts before the heavy imports.

@@ -157,7 +157,10 @@ def test_the_first_reader_that_recognises_a_folder_reads_it(tmp_path, monkeypatc
     (tmp_path / "a").mkdir()
     (tmp_path / "a/other.json").touch()
     root = write_capture(tmp_path / "b")
-    refusal(lambda: read_capture(tmp_path / "a"), "a: no transforms_train.json in this folder; export the capture")
+    refusal(
+        lambda: read_capture(tmp_path / "a"),
+        "a: no checkpoint/*.frame or transforms_train.json in this folder; export the capture",
+    )
     monkeypatch.setattr(read, "READERS", (*read.READERS, OtherReader()))
     options = {"principal_point": "opengl", "skip_bad": False, "follow_links": True}
     expected = (tmp_path / "a").resolve(), {"background": (0.0, 0.0, 0.0), **options}
@@ -165,7 +168,7 @@ def test_the_first_reader_that_recognises_a_folder_reads_it(tmp_path, monkeypatc
     assert read_capture(root).root == root.resolve()
     (root / "other.json").touch()
     assert read_capture(root).root == root.resolve()
-    marks = "no transforms_train.json or other.json in this folder"
+    marks = "no checkpoint/*.frame or transforms_train.json or other.json in this folder"
     refusal(lambda: read_capture(tmp_path), f"{tmp_path}: {marks}; did you mean {tmp_path / 'a'}?")
 
 
@@ -194,7 +197,11 @@ def test_missing_folder(tmp_path):
 
 
 def test_no_transforms_file(root, tmp_path):
-    refusal(lambda: read_capture(tmp_path), f"{tmp_path}: no transforms_train.json", f"did you mean {root}?")
+    refusal(
+        lambda: read_capture(tmp_path),
+        f"{tmp_path}: no checkpoint/*.frame or transforms_train.json",
+        f"did you mean {root}?",
+    )
 
 
 def test_broken_json(root):

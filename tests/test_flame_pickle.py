@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mgavatar.errors import DataError
+from mgavatar.head.load import read_head_model
 from mgavatar.head.flame_pickle import read_flame_pickle
 
 DIALECTS = [(0, False), (1, False), (2, True), (2, False), ("python2", True), (3, False), (4, False), (5, False)]
@@ -293,3 +294,31 @@ def test_damaged_files_raise_data_errors_and_run_nothing(tmp_path, calls, data):
     assert message.startswith(f"{path}: ")
     assert "\n" not in message
     assert not calls
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"<!DOCTYPE html><html><body>Sign in</body></html>", "a web page (HTML), perhaps a login page"),
+        (b"\xef\xbb\xbf\n <html lang='en'>", "a web page (HTML), perhaps a login page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:abc\nsize 53023716\n", "a pointer file of Git LFS"),
+        (b'{"error": "not logged in"}', "the error message of a server"),
+        (b"/annex/objects/SHA256E-s53023716--abc.pkl", "a pointer file of git-annex"),
+        (b"PK\x03\x04" + bytes(40), "a zip archive; unpack it"),
+        (b"\x1f\x8b" + bytes(40), "a gzip archive; unpack it"),
+        (b"", "the file is empty; download it again"),
+    ],
+    ids=["page", "page with a mark", "lfs", "json", "annex", "zip", "gzip", "empty"],
+)
+@pytest.mark.parametrize("suffix", ["pkl", "npz"])
+def test_what_a_failed_download_leaves_is_named(tmp_path, content, words, suffix):
+    """In place of a head model, in plain words with the remedy."""
+    path = tmp_path / f"generic_model.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        read_head_model(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    if suffix == "pkl" or "archive" not in words:
+        assert words in message

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Protocol, get_args
 
 from mgavatar.capture.images import without_bad_images
-from mgavatar.capture.readers import vhap
+from mgavatar.capture.readers import insta, vhap
 from mgavatar.capture.subject import Subject
 from mgavatar.config import Background, PrincipalPoint, background_color
 from mgavatar.errors import DataError
@@ -36,7 +36,7 @@ class Reader(Protocol):
         ...
 
 
-READERS: tuple[Reader, ...] = (vhap,)
+READERS: tuple[Reader, ...] = (insta, vhap)
 """All formats, in the order in which they are tried."""
 
 
@@ -54,7 +54,8 @@ def read_capture(
 
     Args:
         root: Folder with ``transforms_train.json``, and ``_val`` and ``_test`` if there are any. Paths in them are
-            relative to it and may lead to its sibling folders, as in VHAP's combined (UNION) captures.
+            relative to it and may lead to its sibling folders, as in VHAP's combined (UNION) captures. Or a folder of
+            INSTA or metrical-tracker, with ``checkpoint/*.frame``.
         background: Colour that the images are composited on: ``"white"``, VHAP's default, ``"black"``, or ``"R,G,B"``
             with numbers from 0 to 255. Images with a matte of their own are composited on it.
         principal_point: ``"center"`` puts it into the image centre, as GaussianAvatars does; ``"opencv"`` takes

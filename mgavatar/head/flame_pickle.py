@@ -225,9 +225,9 @@ def _tree(content: dict[Any, Any], *, path: Path, depth: int) -> dict[str, Any]:
             tree[name] = _tree(value, path=path, depth=depth + 1)
         elif isinstance(value, int | float | str):
             tree[name] = value
-        elif isinstance(value, _Record | list):
+        elif isinstance(value, _Record | list | tuple):
             try:
-                tree[name] = _array(value, depth=0)
+                tree[name] = _array(list(value) if isinstance(value, tuple) else value, depth=0)
             except (ValueError, TypeError, OverflowError) as error:
                 raise DataError(f"{path}: {one_line(name, limit=40)} is damaged ({one_line(error)})") from error
     return tree

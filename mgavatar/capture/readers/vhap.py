@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mgavatar.camera import Camera
-from mgavatar.capture.pixels import has_alpha, image_size, read_matte
+from mgavatar.capture.failures import Failures
+from mgavatar.capture.mattes import images_with_mattes
+from mgavatar.capture.pixels import image_size
 from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
 from mgavatar.capture.transforms import FrameReader, LinkedFolders, camera_of_frame
 from mgavatar.config import PrincipalPoint
@@ -47,7 +49,7 @@ def read(
 ) -> Subject:
     """Read a capture in this layout; arguments, result and errors are those of ``read_capture``."""
     links = LinkedFolders(root.parent, follow_all=follow_links)
-    failures = _Failures(root, skip=skip_bad)
+    failures = Failures(root, skip=skip_bad)
     entries = {split: list(_split_entries(root, split, principal_point, links, failures)) for split in SPLITS}
     failures.settle(sum(len(own) for own in entries.values()), "frames")
     for link, target in links.followed.items():
@@ -60,7 +62,9 @@ def read(
     kept = {split: [entry for entry in own if entry.timestep_id in row_of] for split, own in entries.items()}
     if not kept["train"]:
         raise DataError(f"{root / MARK}: no training frame can be used")
-    mattes = _images_with_mattes(kept)
+    mattes = images_with_mattes(
+        (entry.image_path, entry.camera) for own in kept.values() for entry in own if entry.mask_path is None
+    )
     return Subject(
         root=root,
         frames={split: tuple(entry.frame(row_of, background, mattes) for entry in kept[split]) for split in SPLITS},
@@ -69,41 +73,6 @@ def read(
         background=np.array(background, np.float32),
         ground_truth=next(iter(sorted((root / "ground_truth").glob("*.npz"))), None),
     )
-
-
-@dataclass
-class _Failures:
-    """Frames or timesteps that cannot be used.
-
-    Attributes:
-        root: The capture.
-        skip: Leave them out instead of refusing the capture.
-        found: What is wrong, by their names.
-    """
-
-    root: Path
-    skip: bool
-    found: dict[str, DataError] = field(default_factory=dict)
-
-    def settle(self, n_good: int, kind: str) -> None:
-        """Log what is left out, or refuse the capture because of the first failure.
-
-        Args:
-            n_good: Number of those without a failure.
-            kind: Word for them in messages.
-        """
-        if not self.found:
-            return
-        first = next(iter(self.found.values()))
-        if not self.skip or not n_good:
-            # Where most fail, the capture is to blame and not a frame of it.
-            hint = "; --skip-bad leaves such frames out" if len(self.found) <= n_good and not self.skip else ""
-            raise DataError(f"{first}{hint}")
-        names = ", ".join(list(self.found)[:3]) + (", …" if len(self.found) > 3 else "")
-        log.warning(
-            "%s: %d %s are left out: %s; the first because of %s", self.root, len(self.found), kind, names, first
-        )
-        self.found.clear()
 
 
 @dataclass(frozen=True)
@@ -133,7 +102,7 @@ class _Entry:
 
 
 def _split_entries(
-    root: Path, split: Split, principal_point: PrincipalPoint, links: LinkedFolders, failures: _Failures
+    root: Path, split: Split, principal_point: PrincipalPoint, links: LinkedFolders, failures: Failures
 ) -> Iterator[_Entry]:
     path = root / f"transforms_{split}.json"
     if split != "train" and not path.exists():
@@ -193,20 +162,6 @@ def _warn_of_off_centre(entries: dict[Split, list[_Entry]], root: Path, principa
             )
 
 
-def _images_with_mattes(entries: dict[Split, list[_Entry]]) -> frozenset[Path]:
-    """Return the images without a mask whose alpha channel has a matte.
-
-    Some programs write an opaque alpha channel into every image: the first one that has the channel tells.
-    """
-    bare = {entry.image_path: entry.camera for own in entries.values() for entry in own if entry.mask_path is None}
-    candidates = [path for path in bare if has_alpha(path)]
-    if not candidates:
-        return frozenset()
-    camera = bare[candidates[0]]
-    matte = read_matte(candidates[0], (camera.width, camera.height), alpha_only=True)
-    return frozenset(candidates if matte.min() < 255 else ())
-
-
 def _check_duplicates(entries: dict[Split, list[_Entry]], root: Path) -> None:
     """Refuse a split that has an image twice.
 
@@ -238,7 +193,7 @@ def _params_of_timesteps(entries: dict[Split, list[_Entry]], root: Path) -> dict
     return params_of
 
 
-def _read_params(params_of: dict[int, Path], failures: _Failures) -> tuple[HeadParams, list[int]]:
+def _read_params(params_of: dict[int, Path], failures: Failures) -> tuple[HeadParams, list[int]]:
     """Read the parameters of all timesteps, and return them with the timesteps that could be read.
 
     Numbers of coefficients must agree. Identity and offset are those of the first timestep: sequences that were
