@@ -17,8 +17,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mgavatar.errors import DataError
-from mgavatar.head.load import read_head_model
 from mgavatar.head.flame_pickle import read_flame_pickle
+from mgavatar.head.load import read_head_model
 
 DIALECTS = [(0, False), (1, False), (2, True), (2, False), ("python2", True), (3, False), (4, False), (5, False)]
 
