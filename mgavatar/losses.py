@@ -27,6 +27,7 @@ def _window(channels: int, dtype: torch.dtype, device: torch.device) -> tuple[Te
 def _blur(maps: Tensor) -> Tensor:
     """Convolve maps [C, H, W] with the separable window; it is symmetric, and so its own adjoint."""
     vertical, horizontal = _window(len(maps), maps.dtype, maps.device)
+    # One group per map: each is blurred on its own.
     maps = functional.conv2d(maps[None], vertical, padding=(5, 0), groups=len(maps))
     return functional.conv2d(maps, horizontal, padding=(0, 5), groups=maps.shape[1])[0]
 
@@ -40,7 +41,8 @@ class _Ssim(torch.autograd.Function):
         c = mu_x**2 + mu_y**2 + _C1
         d = (xx - mu_x**2) + (yy - mu_y**2) + _C2
         ssim = a * b / (c * d)
-        # Derivatives by the blurred image, its square and its product with the target.
+        # Derivatives of the sum by the blurred image, its square and its product with the target. mu_x stands in all
+        # four factors: in a and c itself, in b and d by the products that the covariances subtract.
         by_xx = -ssim / d
         by_xy = 2 * a / (c * d)
         by_mu = 2 * mu_y * b / (c * d) - 2 * ssim * mu_x / c - by_xy * mu_y - 2 * by_xx * mu_x
@@ -79,6 +81,7 @@ def image_loss(image: Tensor, target: Tensor, config: ImageLossConfig) -> Tensor
         target: Image of the capture, of the same shape.
         config: The weights.
     """
+    # The fused kernel of the CPU is several times faster there than convolutions, and computes the same.
     if image.device.type == "cpu" and image.dtype == torch.float32:
         absolute, similarity = compare_images(image, target)
         return config.color * absolute + config.ssim * (1.0 - similarity)

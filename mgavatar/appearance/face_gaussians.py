@@ -51,13 +51,27 @@ class FaceFrames:
 
 
 class FaceGaussians(nn.Module):
-    """Gaussians bound to faces: at first one per face, at its centre; density control adds and removes others."""
+    """Gaussians bound to faces: at first one per face, at its centre; density control adds and removes others.
+
+    Attributes:
+        parameter_names: Names of the parameters, with N rows each.
+        local_means: Centres mu* in units of k, shape [N, 3].
+        quats: Rotations wxyz in the face's frame, of any length, shape [N, 4].
+        log_scales: Logarithms of the standard deviations in units of k, shape [N, 3].
+        opacity_logits: Shape [N].
+        face_ids: Face that owns each Gaussian, shape [N], int64.
+        uvs: Texture coordinate below each Gaussian, shape [N, 2].
+    """
+
+    face_ids: Tensor
+    uvs: Tensor
 
     def __init__(self, n_faces: int, config: ResolvedAppearanceConfig, device: torch.device) -> None:
+        """Put a flat Gaussian of the configured size and opacity on each face."""
         super().__init__()
         self.n_faces = n_faces
         along, across = config.initial_scale, config.initial_thickness
-        scales = torch.tensor([along, across, along], device=device)  # edge, normal, their cross product
+        scales = torch.tensor([along, across, along], device=device)  # axes of a face: edge, normal, cross product
         quats = torch.zeros(n_faces, 4, device=device)
         quats[:, 0] = 1.0
         logit = torch.logit(torch.tensor(config.initial_opacity)).item()
@@ -71,8 +85,6 @@ class FaceGaussians(nn.Module):
             n_others = (config.sh.degree + 1) ** 2 - 1
             self.sh_constant = nn.Parameter(torch.zeros(n_faces, 3, device=device))
             self.sh_others = nn.Parameter(torch.zeros(n_faces, n_others, 3, device=device))
-        self.face_ids: Tensor
-        self.uvs: Tensor
         self.register_buffer("face_ids", torch.arange(n_faces, device=device))
         self.register_buffer("uvs", torch.zeros(n_faces, 2, device=device))
 
@@ -129,6 +141,8 @@ def face_uvs(
         det = (d11 * d22 - d12 * d12).clamp(min=1e-20)
         v = (d22 * p1 - d12 * p2) / det
         w = (d11 * p2 - d12 * p1) / det
+        # Outside of the face a weight is negative. The weights sum to 1, so after clamping to at least 1, and dividing
+        # by the sum gives a point of the face.
         weights = torch.stack([1 - v - w, v, w], 1).clamp(min=0.0)
         weights = weights / weights.sum(1, keepdim=True)
         return (weights[:, :, None] * face_vt[face_ids]).sum(1)

@@ -44,10 +44,27 @@ class PosedMesh:
 
 
 class FrozenHead:
-    """The result of the geometry stage; nothing in it learns any more."""
+    """The result of the geometry stage; nothing in it learns any more.
+
+    Attributes:
+        head: The personal head.
+        body: Its subdivided head model.
+        canonical: Vertices of the canonical head ``mu_c`` [m], shape [V, 3].
+        frames: Face frames of the canonical head.
+        low: Lowest corner of its bounding box [m], shape [3].
+        high: Highest corner [m], shape [3].
+        extent: Diagonal of its bounding box [m], with which density control compares sizes.
+        face_vt: Texture coordinates of the faces' corners, shape [F, 3, 2].
+        canonical_map: ``M_cano``, canonical positions in units of the head's size, shape [3, H, W], or empty.
+    """
 
     def __init__(self, head: PersonalHead, *, uv_resolution: int | None) -> None:
-        """Freeze ``head``; ``uv_resolution`` is the size of the position maps, or None without them."""
+        """Freeze a personal head.
+
+        Args:
+            head: The personal head.
+            uv_resolution: Height and width of the position maps, or None without them.
+        """
         self.head = head
         self.body = head.body
         fine = self.body.fine
@@ -60,7 +77,6 @@ class FrozenHead:
         low, high = self.canonical.min(0).values, self.canonical.max(0).values
         self.low, self.high = low, high
         self.extent = float((high - low).norm())
-        """Diagonal of the canonical head [m]: the yardstick of density control."""
         vt, ft = torch.tensor(fine.vt, device=device), torch.tensor(fine.ft, dtype=torch.int32, device=device)
         self.face_vt = vt[ft.long()]
         self._uv: UvMap | None = None
@@ -86,6 +102,7 @@ class FrozenHead:
     def _map(self, verts: Tensor) -> Tensor:
         if self._uv is None:
             return self.canonical_map
+        # One scale for all axes, so that the largest side goes from -1 to 1 and distances keep their ratios.
         center, half = (self.low + self.high) / 2, (self.high - self.low).max() / 2
         return position_map(self._uv, (verts - center) / half)
 
@@ -97,6 +114,7 @@ class FrozenHead:
             maps_grad: Keep the gradient through OffsetNet's inputs too; training does without it.
         """
         verts = self.head.posed(pose).verts
+        # Training keeps no graph of the maps: the head is frozen, and tuned poses have their gradient through Eq. 8.
         with torch.set_grad_enabled(maps_grad and torch.is_grad_enabled()):
             still = self.head.posed(pose.without_root()).verts if self._uv is not None else verts
             theta = pose.joint_rotations().reshape(-1)
@@ -109,22 +127,32 @@ class FrozenHead:
         """Return the head at a timestep of its capture, without a gradient; the most recently used ones are cached."""
         if timestep not in self._posed:
             if len(self._posed) >= _CACHED_POSES:
-                self._posed.popitem(last=False)
+                self._posed.popitem(last=False)  # the least recently used one, because hits move to the end
             self._posed[timestep] = self.posed(self.head.pose(timestep))
         self._posed.move_to_end(timestep)
         return self._posed[timestep]
 
 
 class Appearance(nn.Module):
-    """Face-bound Gaussians with ColorNet (or spherical harmonics) and OffsetNet."""
+    """Face-bound Gaussians with ColorNet (or spherical harmonics) and OffsetNet.
+
+    Attributes:
+        frozen: The head; no submodule, because its parameters are not the appearance's.
+        gaussians: The Gaussians.
+        color_net: ColorNet, or None if colours are spherical harmonics.
+        offset_net: OffsetNet, or None if it is switched off.
+        view_frame: Frame of the view directions: ``"canonical"``, ``"world"`` or ``"none"``.
+    """
 
     def __init__(self, frozen: FrozenHead, config: ResolvedConfig, *, seed: int) -> None:
+        """Bind one Gaussian to each face; ``seed`` is that of the hash grid's table."""
         super().__init__()
         a = config.appearance
         self.frozen = frozen
         self.config = config
         device = frozen.canonical.device
         self.gaussians = FaceGaussians(len(frozen.body.faces), a, device)
+        # Gaussians may leave the surface by about their face's size; a twentieth of the head leaves room for all.
         margin = 0.05 * (frozen.high - frozen.low)
         self.color_net = (
             ColorNet(frozen.low - margin, frozen.high + margin, a.color_net, seed=seed).to(device)
@@ -134,6 +162,7 @@ class Appearance(nn.Module):
         self.view_frame = a.color_net.view_frame if a.colors == "color_net" else a.sh.view_frame
         self.offset_net = OffsetNet(a.offset_net).to(device) if a.offset_net.enabled else None
         self._forget()
+        # A loaded state brings other faces and texture coordinates.
         self.register_load_state_dict_post_hook(lambda module, _: module._forget())
         self.rebind()
 
@@ -171,6 +200,7 @@ class Appearance(nn.Module):
         """Return ``O_map`` of Eq. 10, [13, H, W], and the row of it that each Gaussian reads, [N, 13]."""
         if self.offset_net is None:
             return None
+        # The sampler is kept until density control changes the Gaussians: until then, texture coordinates stay.
         maps = self.offset_net(self.frozen.canonical_map, posed.pose_map, posed.theta)
         if self._sampler is None:
             self._sampler = uv_sampler(self.gaussians.uvs, *maps.shape[1:])
@@ -179,6 +209,7 @@ class Appearance(nn.Module):
     def _directions(self, means: Tensor, posed: PosedMesh, camera: Camera) -> Tensor:
         """Unit view directions of Eq. 9, in the frame that ``view_frame`` names."""
         position = torch.tensor(camera.position, dtype=torch.float32, device=means.device)
+        # No gradient: a Gaussian must not move in order to be seen from where its colour is better.
         means = means.detach()
         if self.view_frame in ("world", "none"):
             return torch.nn.functional.normalize(means - position, dim=1)

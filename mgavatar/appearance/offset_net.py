@@ -51,6 +51,7 @@ def _gather_pairs(grad: Tensor, dim: int) -> Tensor:
     Input i is read by outputs 2i and 2i + 1 with weight 3/4, and by their outer neighbours 2i - 1 and 2i + 2 with 1/4.
     The first and the last input are read with 1/4 more by their own outputs, whose outer neighbour is missing.
     """
+    # Outputs come in pairs: even[i] is output 2i, odd[i] is output 2i + 1.
     n = grad.shape[dim] // 2
     even, odd = grad.unflatten(dim, (n, 2)).unbind(dim + 1)
     out = (even + odd).mul_(0.75)
@@ -94,6 +95,7 @@ class OffsetNet(nn.Module):
             _conv(c + c // 2, c), Upsample(), _conv(c, c), Upsample(),
             _conv(c, c // 2), Upsample(), _conv(c // 2, c // 2),
         )  # fmt: skip
+        # The last layer starts at zero: the Gaussians are drawn as they are until the maps have learned something.
         self.last = nn.Conv2d(c, N_OFFSETS, 3, padding=1)
         nn.init.zeros_(self.last.weight)
         assert self.last.bias is not None  # noqa: S101  for the type checker
@@ -112,6 +114,7 @@ class OffsetNet(nn.Module):
         """
         maps = self.embed(_laid_out(torch.cat([canonical_map, pose_map, self.latent])[None]))
         features = self.encoder(maps)
+        # One vector for all texels: the pose is the same everywhere.
         pose = self.encode_pose(theta)[None, :, None, None].expand(-1, -1, *features.shape[2:])
         decoded = self.decoder(_laid_out(torch.cat([features, pose], 1)))
         return self.last(torch.cat([decoded, maps], 1))[0]

@@ -40,7 +40,15 @@ def binding_loss(
 
 
 class AppearanceStage:
-    """The stage that fits colours, Gaussians and OffsetNet, one optimizer step at a time."""
+    """The stage that fits colours, Gaussians and OffsetNet, one optimizer step at a time.
+
+    Attributes:
+        appearance: The appearance on the frozen head.
+        iterations: Configured iterations of the schedule.
+        position: Place in the schedule of rates and density control, in configured iterations.
+        decay: Factor of all rates per configured iteration.
+        density: Density control.
+    """
 
     name = "appearance"
 
@@ -50,7 +58,6 @@ class AppearanceStage:
         a = config.appearance
         self.iterations = a.iterations
         self.position = 0.0
-        """Place in the schedule of rates and density control, in iterations as configured."""
         g = appearance.gaussians
         groups: list[dict[str, Any]] = [
             {"params": [g.local_means], "lr": a.lr_means},
@@ -62,7 +69,7 @@ class AppearanceStage:
             groups.append({"params": list(appearance.color_net.mlp.parameters()), "lr": a.color_net.lr})
         else:
             groups.append({"params": [g.sh_constant], "lr": a.sh.lr})
-            groups.append({"params": [g.sh_others], "lr": a.sh.lr / 20.0})
+            groups.append({"params": [g.sh_others], "lr": a.sh.lr / 20.0})  # the field's rates
         if appearance.offset_net is not None:
             groups.append({"params": list(appearance.offset_net.parameters()), "lr": a.offset_net.lr})
         self.poses = appearance.frozen.head.poses
@@ -77,6 +84,7 @@ class AppearanceStage:
                 },
                 {"params": [self.poses["translation"]], "lr": tuning.lr_translation},
             ]
+        # Adam's usual epsilon of 1e-8 would stop Gaussians that cover few pixels, whose gradients are as small.
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self.decay = a.lr_final_factor ** (1.0 / max(1, a.iterations))
         self.density = DensityControl(g, a.density, extent=appearance.frozen.extent, seed=seed)
@@ -101,18 +109,20 @@ class AppearanceStage:
             loss.backward()
         self.optimizer.step()
         if appearance.color_net is not None:
+            # The grid's own optimizer has no group here, so its rate follows from the place in the schedule.
             appearance.color_net.grid.adam_step(a.color_net.lr * self.decay**self.position)
         for group in self.optimizer.param_groups:
             group["lr"] *= self.decay**schedule_step
         before = self.position
         self.position += schedule_step
         self._control_density(screen_grads, rendering, before)
+        # One transfer from the device for all terms: each would wait for it on its own.
         terms = torch.stack([loss, image_term, binding_term, offset_term]).detach().tolist()
         return dict(zip(("loss", "image", "binding", "offset"), terms, strict=True)) | {"gaussians": len(g)}
 
     def _posed(self, timestep: int) -> PosedMesh:
         frozen = self.appearance.frozen
-        if self.config.appearance.head_tuning.enabled:
+        if self.config.appearance.head_tuning.enabled:  # poses still change, so that none can be kept
             return frozen.posed(frozen.head.pose(timestep))
         return frozen.at_timestep(timestep)
 
@@ -149,7 +159,9 @@ class AppearanceStage:
     def _resize(self, n: int) -> None:
         g = self.appearance.gaussians
         self.appearance.resize(n)
-        names = ["local_means", "log_scales", "quats", "opacity_logits"]  # as in the optimizer's groups
+        # The optimizer's first groups hold one parameter of the Gaussians each, in this order; those of the networks
+        # follow and keep their parameters.
+        names = ["local_means", "log_scales", "quats", "opacity_logits"]
         names += [name for name in SH_PARAMETERS if name in g.parameter_names]
         for name, group in zip(names, self.optimizer.param_groups, strict=False):
             group["params"] = [getattr(g, name)]

@@ -329,10 +329,12 @@ def _read_mask(frame: Frame) -> np.ndarray:
 
 
 def _resampled(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Exact area means: pixels that a new pixel covers in part count in part, at any ratio of sizes."""
+    """Resample to exact area means: old pixels that a new one covers in part count in part, at any ratio of sizes."""
     old_height, old_width, channels = pixels.shape
     if (old_width, old_height) == (width, height):
         return np.require(pixels, requirements=["C", "W"])  # torch wants to be able to write
+    # A sparse matrix multiplies from the left, along the first axis: rows first, then the same for columns, which a
+    # transpose puts in their place.
     rows = _area_weights(old_height, height) @ pixels.reshape(old_height, -1).astype(np.float32)
     columns = rows.reshape(height, old_width, channels).transpose(1, 0, 2).reshape(old_width, -1)
     small = (_area_weights(old_width, width) @ columns).reshape(width, height, channels).transpose(1, 0, 2)
@@ -341,7 +343,8 @@ def _resampled(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=16)
 def _area_weights(n_old: int, n_new: int) -> scipy.sparse.csr_array:
-    """Share of each old pixel in each new one along an axis, [n_new, n_old]; rows sum to 1."""
+    """Return the share of each old pixel in each new one along an axis, shape [n_new, n_old]; rows sum to 1."""
+    # New pixel i covers edges[i] to edges[i + 1] in old pixels, and shares with old pixel j what lies in j to j + 1.
     edges = np.arange(n_new + 1) * (n_old / n_new)
     old = np.arange(n_old)
     overlap = np.minimum(edges[1:, None], old + 1) - np.maximum(edges[:-1, None], old)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mgavatar.config import ResolvedGeometryConfig
 from mgavatar.geometry.refine_net import RefineNet
 from mgavatar.head.body import Body
-from mgavatar.head.params import HeadParams, Pose, pad_or_truncate
+from mgavatar.head.params import MOTION_KEYS, HeadParams, Pose, pad_or_truncate
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,20 @@ class PosedHead:
 
 
 class PersonalHead(nn.Module):
-    """Learnable identity beta, offset networks, and pose, expression and translation of every timestep."""
+    """Learnable identity beta, offset networks, and pose, expression and translation of every timestep.
+
+    Attributes:
+        body: The subdivided head model.
+        betas: Identity coefficients, shape [n_shape].
+        poses: FLAME's parameters of all T timesteps by their names, shapes as in
+            :class:`~mgavatar.head.params.HeadParams`.
+        refine: RefineNet.
+        tracked_offsets: The tracker's vertex offsets on the base mesh [m], shape [V_base, 3]; empty if unused.
+        tracked_joints: Rest joints of the tracker's own head [m], shape [5, 3].
+    """
+
+    tracked_offsets: Tensor
+    tracked_joints: Tensor
 
     def __init__(
         self,
@@ -43,7 +56,7 @@ class PersonalHead(nn.Module):
         *,
         train_rows: Sequence[int] | None = None,
     ) -> None:
-        """Start as tracked.
+        """Start at the tracked parameters, with offsets of zero.
 
         Args:
             body: The subdivided head model.
@@ -53,33 +66,23 @@ class PersonalHead(nn.Module):
         """
         super().__init__()
         self.body = body
-        device = body.device
-        n_expr = body.model.n_expr
-        start = (
-            pad_or_truncate(params.shape, body.model.n_shape) if config.start_from_tracked_shape else 0.0 * params.shape
-        )
-        self.betas = nn.Parameter(torch.from_numpy(pad_or_truncate(np.asarray(start), body.model.n_shape)).to(device))
-        tracked = {
-            "expr": pad_or_truncate(params.expr, n_expr),
-            "rotation": params.rotation,
-            "neck_pose": params.neck_pose,
-            "jaw_pose": params.jaw_pose,
-            "eyes_pose": params.eyes_pose,
-            "translation": params.translation,
-        }
-        self.poses = nn.ParameterDict(
-            {
-                name: nn.Parameter(torch.tensor(value, dtype=torch.float32, device=device))
-                for name, value in tracked.items()
-            }
-        )
         self.config = config
+        device = body.device
+        betas = pad_or_truncate(params.shape, body.model.n_shape)
+        self.betas = nn.Parameter(
+            torch.from_numpy(betas if config.start_from_tracked_shape else 0.0 * betas).to(device)
+        )
+        self.poses = nn.ParameterDict()
+        for name in MOTION_KEYS:
+            tracked = getattr(params, name)
+            if name == "expr":
+                tracked = pad_or_truncate(tracked, body.model.n_expr)
+            self.poses[name] = nn.Parameter(torch.tensor(tracked, dtype=torch.float32, device=device))
         self.learn_poses()
-        self.tracked_offsets: Tensor
+        # Not persistent: both follow from the tracked parameters, which an avatar file has.
         known = _base_offsets(params.static_offset, len(body.v_template)) if config.tracked_offsets else None
         offsets = torch.zeros(0, 3) if known is None else torch.from_numpy(known)
         self.register_buffer("tracked_offsets", offsets.to(device), persistent=False)
-        self.tracked_joints: Tensor
         with torch.no_grad():
             self.register_buffer("tracked_joints", body.joints(self._tracked_shape(params)), persistent=False)
         mean_pose = mean_joint_pose(params, rows=train_rows)
@@ -93,12 +96,7 @@ class PersonalHead(nn.Module):
 
     def pose(self, timestep: int) -> Pose:
         """Return the refined parameters of a timestep of the capture."""
-        return Pose(
-            *(
-                self.poses[name][timestep]
-                for name in ("expr", "rotation", "neck_pose", "jaw_pose", "eyes_pose", "translation")
-            )
-        )
+        return Pose(**{name: self.poses[name][timestep] for name in MOTION_KEYS})
 
     def shaped(self) -> Tensor:
         """Return the parametric identity ``mu_bar`` [m], shape [V, 3], with the tracker's offsets if they are used."""
@@ -112,6 +110,7 @@ class PersonalHead(nn.Module):
         identity = self.refine.identity_offsets(features)
         by_pose = self.refine.pose_offsets(features, torch.cat([pose.neck_pose, pose.jaw_pose, pose.eyes_pose]))
         canonical = shaped + identity
+        # Joints come from the canonical head alone: they would wander with the pose if pose offsets moved them.
         joints = self.joints(canonical)
         return PosedHead(shaped, identity, by_pose, self.body.posed(canonical + by_pose, pose, joints=joints))
 
@@ -143,6 +142,7 @@ def _base_offsets(static_offset: np.ndarray | None, n_verts: int) -> np.ndarray 
     if static_offset is None:
         return None
     offsets = np.zeros((n_verts, 3), np.float32)
+    # VHAP adds teeth to FLAME and may have more vertices than the head model, or fewer; the first ones are FLAME's own.
     n = min(n_verts, len(static_offset))
     offsets[:n] = static_offset[:n]
     return offsets

@@ -31,6 +31,12 @@ class RefineNet(nn.Module):
     """Identity and pose offsets of every vertex.
 
     Vertices keep their place in the triplane, so sampling it is a fixed matrix.
+
+    Attributes:
+        unit: Offset that a network's output of 1 means [m].
+        planes: Features of the three planes, texels row by row, shape [3, resolution^2, channels].
+        phi_id: Network of Eq. 1, or None if switched off.
+        phi_pose: Network of Eq. 2, or None if switched off.
     """
 
     def __init__(self, v_template: Tensor, config: ResolvedGeometryConfig, *, mean_pose: Tensor) -> None:
@@ -50,6 +56,8 @@ class RefineNet(nn.Module):
         self.centered = config.center_pose_offsets
         self.mean_pose: Tensor
         self.register_buffer("mean_pose", mean_pose.clone())
+        # One scale for all axes: a texel is as long as it is wide on the head. Built on the CPU, so that the weights
+        # have the same bits whatever the device.
         low, high = v_template.min(0).values, v_template.max(0).values
         place = ((v_template - low) / (high - low).max()).cpu()
         pairs = ((0, 1), (1, 2), (2, 0))

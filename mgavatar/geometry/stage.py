@@ -30,7 +30,14 @@ def laplacian_loss(gaussians: VertexGaussians, posed: PosedHead, scales: Tensor)
 
 
 class GeometryStage:
-    """The stage that fits the mesh with vertex-bound Gaussians, one optimizer step at a time."""
+    """The stage that fits the mesh with vertex-bound Gaussians, one optimizer step at a time.
+
+    Attributes:
+        gaussians: The Gaussians on the personal head.
+        iterations: Configured iterations of the schedule.
+        position: Place in the schedule of the rates, in configured iterations.
+        decay: Factor of all rates per configured iteration.
+    """
 
     name = "geometry"
 
@@ -39,7 +46,6 @@ class GeometryStage:
         self.config = config
         self.iterations = config.geometry.iterations
         self.position = 0.0
-        """Place in the schedule of the rates, in iterations as configured."""
         g, head = config.geometry, gaussians.head
         poses = head.poses
         groups = [
@@ -52,6 +58,7 @@ class GeometryStage:
             {"params": [gaussians.log_scales], "lr": g.lr_scale},
             {"params": [gaussians.colors], "lr": g.lr_color},
         ]
+        # Adam's usual epsilon of 1e-8 would stop Gaussians that cover few pixels, whose gradients are as small.
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
         self.decay = g.lr_final_factor ** (1.0 / max(1, g.iterations))
 
@@ -71,11 +78,13 @@ class GeometryStage:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
+        # Rates fall with the schedule, not with the steps: a budget makes steps shorter or longer than an iteration.
         for group in self.optimizer.param_groups:
             group["lr"] *= self.decay**schedule_step
         self.position += schedule_step
         if not bool(torch.isfinite(posed.verts).all()):  # such Gaussians are not drawn: no other term shows it
             loss = loss * torch.nan
+        # One transfer from the device for all terms: each would wait for it on its own.
         terms = torch.stack([loss, image_term, offset_term, laplacian_term]).detach().tolist()
         return dict(zip(("loss", "image", "offset", "laplacian"), terms, strict=True)) | {"gaussians": len(scales)}
 

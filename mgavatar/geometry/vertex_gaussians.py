@@ -14,18 +14,29 @@ from mgavatar.kernels.rasterize import RasterSettings, Rendering
 
 
 class VertexGaussians(nn.Module):
-    """One Gaussian per vertex with few parameters: no rotation, one scale, opacity 1, one colour for all directions."""
+    """One Gaussian per vertex with few parameters: no rotation, one scale, opacity 1, one colour for all directions.
+
+    Attributes:
+        head: The personal head.
+        log_scales: Logarithms of the standard deviations [m], shape [V].
+        colors: Coefficients of Y_00 in RGB, 0 for grey, shape [V, 3].
+        least_edge: Least length that the edges at a vertex count as [m].
+        start_edges: Mean length of the edges at each vertex when the stage starts [m], shape [V].
+    """
+
+    start_edges: Tensor
 
     def __init__(self, head: PersonalHead, config: ResolvedConfig) -> None:
+        """Start at a share of the edges' lengths, in grey."""
         super().__init__()
         self.head = head
         self.config = config
+        # Vertices without a face, or with faces of no size, as between closed lips, would start with no size at all.
         edges = head.body.edge_lengths(head.body.shaped(head.betas.detach()))
         self.least_edge = 0.2 * float(edges[edges > 0].median())
         edges = edges.clamp(min=self.least_edge)
         self.log_scales = nn.Parameter(torch.log(config.geometry.initial_scale * edges))
         self.colors = nn.Parameter(torch.zeros(head.body.n_verts, 3, device=edges.device))
-        self.start_edges: Tensor
         self.register_buffer("start_edges", edges, persistent=False)
 
     def scales(self, posed: PosedHead) -> Tensor:
@@ -36,7 +47,8 @@ class VertexGaussians(nn.Module):
         scales = self.log_scales.exp()
         if not self.config.geometry.scales_follow_mesh:
             return scales
-        edges = self.head.body.edge_lengths((posed.shaped + posed.identity_offsets).detach())
+        # Of the canonical head: a pose must not change how large a Gaussian is.
+        edges = self.head.body.edge_lengths(posed.shaped + posed.identity_offsets)
         return scales * (edges.clamp(min=self.least_edge) / self.start_edges)
 
     def bound(self, posed: PosedHead, camera: Camera, *, scales: Tensor | None = None) -> Gaussians:
@@ -51,6 +63,7 @@ class VertexGaussians(nn.Module):
         scales = self.scales(posed) if scales is None else scales
         shift = self.config.geometry.surface_shift
         if shift:
+            # No gradient: a Gaussian could otherwise move by growing or by turning the surface.
             normals = self.head.body.normals(verts)
             depth = shift * silhouette_offset(scales.detach(), verts.detach(), normals.detach(), camera)
             verts = verts - depth[:, None] * normals
@@ -84,6 +97,7 @@ def silhouette_offset(sigmas: Tensor, means: Tensor, normals: Tensor, camera: Ca
     Returns:
         Depths [m], shape [N].
     """
+    # The third row of the view matrix gives depths, and depth over focal length is the size of a pixel there.
     row = torch.from_numpy(camera.viewmat[2].astype(np.float32)).to(means.device)
     pixels = (means @ row[:3] + row[3]) / float(camera.K[0, 0])
     away = means - torch.tensor(camera.position, dtype=torch.float32, device=means.device)

@@ -57,6 +57,7 @@ def read(
     _check_duplicates(entries, root)
     _warn_of_off_centre(entries, root, principal_point)
     params_of = _params_of_timesteps(entries, root)
+    # Splits name timesteps by the capture's own numbers, with gaps; rows of the parameters are counted from 0.
     params, timesteps = _read_params(params_of, failures)
     row_of = {timestep: row for row, timestep in enumerate(timesteps)}
     kept = {split: [entry for entry in own if entry.timestep_id in row_of] for split, own in entries.items()}
