@@ -234,6 +234,45 @@ def render(
     print(target)
 
 
+def export(
+    *,
+    avatar: Path,
+    out: Path,
+    to: Literal["auto", "splats", "mesh"] = "auto",
+    pose: str = "neutral",
+    driving: Path | None = None,
+    degree: Literal[0, 1, 2, 3] = 3,
+    up: Literal["y", "-y"] = "y",
+    overwrite: bool = False,
+    device: str = "auto",
+) -> None:
+    """Write an avatar in one pose for other programs, as splats or as a coloured mesh.
+
+    Args:
+        avatar: The avatar, or the folder of its fit.
+        out: FILE.ply (splats, or a mesh), FILE.glb (a mesh, or splats), FILE.obj or FILE.stl (a mesh).
+        to: What the file has, splats or mesh; by default as --out says.
+        pose: neutral, mean, or a frame counted from 0: of --driving, or of the capture.
+        driving: Motion that the frame is of, as in render.
+        degree: Degree of the splats' spherical harmonics.
+        up: Axis that points up in a .ply of splats; -y for viewers that turn such files.
+        overwrite: Replace a file that is there already.
+        device: auto, cpu, cuda or cuda:N.
+    """
+    from mgavatar.avatar import Avatar
+    from mgavatar.device import find_device
+    from mgavatar.driving.read import read_driving
+    from mgavatar.export.export import content_of
+    from mgavatar.export.export import export as run_export
+
+    content = content_of(out, None if to == "auto" else to, up=up, overwrite=overwrite)
+    motion = read_driving(driving) if driving is not None else None
+    loaded = Avatar.load(avatar, device=find_device(device))
+    notes = run_export(loaded, out, to=content, pose=pose, driving=motion, degree=degree, up=up, overwrite=overwrite)
+    _say_all(notes)
+    print(out)
+
+
 def evaluate(
     *,
     avatar: Path,
@@ -336,6 +375,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "synth": synth,
     "fit": fit,
     "render": render,
+    "export": export,
     "evaluate": evaluate,
     "bench": bench,
 }

@@ -47,6 +47,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "driving": ("driving",),
     "scoring": ("scoring",),
     "reporting": ("reporting",),
+    "export": ("export",),
     "pipeline": ("pipeline",),
     "benchmarks": ("benchmarks",),
     "demo": ("demo",),

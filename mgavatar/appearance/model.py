@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -216,6 +216,44 @@ class Appearance(nn.Module):
         quats = posed.frames.quats.detach(), self.frozen.frames.quats
         return directions_on_faces(means, position, self.gaussians.face_ids, *quats)
 
+    def bound(self, posed: PosedMesh) -> tuple[Gaussians, Tensor | None]:
+        """Compute the Gaussians of a pose, without the part of their colours that depends on the view.
+
+        Args:
+            posed: The head in the pose.
+
+        Returns:
+            The Gaussians, whose colours are OffsetNet's share, and ``O_map``, shape [13, H, W], or None without
+            OffsetNet; its share is then zero.
+        """
+        g = self.gaussians
+        offsets = self.offsets(posed)
+        means, quats, scales, opacities, colors = bind_to_faces(
+            posed.frames.all,
+            g.face_ids,
+            *(getattr(g, name) for name in PARAMETERS),
+            offsets=offsets[1] if offsets else None,
+            order=self._order(posed),
+        )
+        return Gaussians(means, quats, scales, opacities, colors), offsets[0] if offsets else None
+
+    def view_colors(self, means: Tensor, posed: PosedMesh, camera: Camera) -> Tensor:
+        """Compute the colours of Gaussians as a camera sees them, without OffsetNet's share (Eq. 9).
+
+        Args:
+            means: Centres in the world [m], shape [N, 3].
+            posed: The head in the pose.
+            camera: The camera, of which only the position matters.
+
+        Returns:
+            RGB, shape [N, 3].
+        """
+        g = self.gaussians
+        directions = self._directions(means, posed, camera)
+        if self.color_net is not None:
+            return self.color_net(g.canonical_means(self.frozen.frames), directions)
+        return sh_colors(g.sh_constant, g.sh_others, directions)
+
     def forward(self, posed: PosedMesh, camera: Camera) -> tuple[Gaussians, Tensor | None]:
         """Compute the Gaussians of one view.
 
@@ -227,23 +265,11 @@ class Appearance(nn.Module):
             The Gaussians ``G_r`` of Section 3.2, and ``O_map``, shape [13, H, W], for its regulariser, or None without
             OffsetNet.
         """
-        g = self.gaussians
-        offsets = self.offsets(posed)
-        means, quats, scales, opacities, more_colors = bind_to_faces(
-            posed.frames.all,
-            g.face_ids,
-            *(getattr(g, name) for name in PARAMETERS),
-            offsets=offsets[1] if offsets else None,
-            order=self._order(posed),
-        )
-        directions = self._directions(means, posed, camera)
-        if self.color_net is not None:
-            colors = self.color_net(g.canonical_means(self.frozen.frames), directions)
-        else:
-            colors = sh_colors(g.sh_constant, g.sh_others, directions)
-        if offsets is not None:
-            colors = colors + more_colors
-        return Gaussians(means, quats, scales, opacities, colors), offsets[0] if offsets else None
+        bound, maps = self.bound(posed)
+        colors = self.view_colors(bound.means, posed, camera)
+        if maps is not None:
+            colors = colors + bound.colors
+        return replace(bound, colors=colors), maps
 
 
 def build_appearance(head: PersonalHead, config: ResolvedConfig, *, seed: int) -> Appearance:

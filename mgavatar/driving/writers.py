@@ -39,6 +39,9 @@ _MAGIC = {"mp4": (4, b"ftyp"), "gif": (0, b"GIF8")}
 
 _MEDIA = {".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".png", ".tif", ".tiff", ".webm", ".webp"}
 
+_SHAPES = {".fbx", ".glb", ".gltf", ".obj", ".ply", ".sog", ".splat", ".spz", ".stl", ".usd", ".usda", ".usdc", ".usdz"}
+"""Suffixes of meshes and splats."""
+
 _BT709 = 1
 
 _TV_RANGE = 1
@@ -70,6 +73,8 @@ def kind_of(out: Path, format: Format = "auto", *, overwrite: bool = False) -> F
         raise DataError(f"{out}: its name says {of_name}, but the format is {kind}; change one of them")
     if kind == "mp4" and of_name is None:
         raise DataError(f"{out}: the name of a video must end in .mp4")
+    if suffix in _SHAPES:
+        raise DataError(f"{out}: render draws pictures; `mgavatar export` writes meshes and splats")
     if suffix in _MEDIA:
         raise DataError(f"{out}: give a name ending in .mp4 or .gif, or a folder (of PNG; of EXR with --format exr)")
     if kind == "mp4" and importlib.util.find_spec("av") is None:
