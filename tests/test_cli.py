@@ -21,9 +21,12 @@ from tiny import tiny_config, tiny_head, write_tiny_capture
 
 from mgavatar import __version__, cli
 from mgavatar.avatar import Avatar
+from mgavatar.capture.read import read_capture
 from mgavatar.config import keys
 from mgavatar.geometry.stage import GeometryStage
 from mgavatar.head.load import save_head_model
+from mgavatar.pipeline import fit
+from mgavatar.presets import preset as preset_of
 from mgavatar.presets import preset_names, to_toml
 
 CHILD_ENV = {**os.environ, "GOMP_SPINCOUNT": "0", "OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}
@@ -51,6 +54,13 @@ class Result:
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
+
+
+@pytest.fixture(scope="module")
+def fitted(inputs) -> Path:
+    """The avatar of a fit to the inputs."""
+    preset, head, subject = preset_of(str(inputs / "tiny.toml")), tiny_head(), read_capture(inputs / "capture")
+    return fit(subject, head, preset, out=inputs / "fitted").path
 
 
 @pytest.fixture
@@ -432,15 +442,14 @@ def test_the_two_commands_of_the_readme(work, mgavatar, monkeypatch):
     assert result.code == 0, result.err
 
 
-def test_a_rendering_without_pyav_is_a_gif(work, mgavatar, monkeypatch):
+def test_a_rendering_without_pyav_is_a_gif(work, fitted, mgavatar, monkeypatch):
     """The default name goes by what can be written; asking for a video says what to install."""
-    assert mgavatar(*fit_args(work)).code == 0
     monkeypatch.chdir(work)
     monkeypatch.setattr("mgavatar.driving.writers.importlib.util.find_spec", lambda name: None)
-    result = mgavatar("render", "--avatar", "run", "--driving", "driving.npz")
+    result = mgavatar("render", "--avatar", fitted, "--driving", "driving.npz")
     assert (result.code, result.out.strip()) == (0, "driving.gif"), result.err
     assert_one_line(
-        mgavatar("render", "--avatar", "run", "--driving", "driving.npz", "--format", "mp4"), "pip install", "PyAV"
+        mgavatar("render", "--avatar", fitted, "--driving", "driving.npz", "--format", "mp4"), "pip install", "PyAV"
     )
 
 
@@ -457,10 +466,9 @@ def test_the_head_model_of_a_bare_fit_is_found_or_asked_for(work, mgavatar, monk
 
 
 @pytest.mark.parametrize(("frames", "n"), [("0:2", 2), ("1:", 2), (":1", 1), ("0:3:2", 2), ("::2", 2), ("0:99", 3)])
-def test_frames_of_a_motion(frames, n, work, mgavatar):
+def test_frames_of_a_motion(frames, n, work, fitted, mgavatar):
     """A slice, as in Python; beyond the end it ends."""
-    assert mgavatar(*fit_args(work)).code == 0
-    result = mgavatar("render", "--avatar", work / "run", "--driving", work / "driving.npz", "--frames", frames,
+    result = mgavatar("render", "--avatar", fitted, "--driving", work / "driving.npz", "--frames", frames,
                       "--out", work / "frames")  # fmt: skip
     assert result.code == 0, result.err
     assert len(list((work / "frames").glob("*.png"))) == n
