@@ -25,6 +25,7 @@ from mgavatar.config import AppearanceConfig, FitConfig, HeadTuningConfig, ShCon
 from mgavatar.gaussians import draw
 from mgavatar.geometry.head import PersonalHead
 from mgavatar.head.body import Body
+from mgavatar.kernels.hash_grid import HashGridShape
 from mgavatar.kernels.uv_map import position_map
 from mgavatar.losses import image_loss
 
@@ -437,6 +438,30 @@ def test_color_net_gives_colours():
     assert colors.isfinite().all()
     assert not torch.allclose(net(means, -directions), colors)
     assert not torch.allclose(net(means.roll(1, 0), directions), colors)
+
+
+@pytest.mark.parametrize(("view_frame", "sees"), [("canonical", True), ("world", True), ("none", False)])
+def test_color_net_sees_directions_unless_told_not_to(view_frame, sees):
+    """Three more inputs, which change the colours, in both frames."""
+    config = replace(tiny_config().appearance.color_net, view_frame=view_frame)
+    net = ColorNet(torch.zeros(3), torch.ones(3), config, seed=0)
+    assert net.mlp[0].in_features == net.grid.n_outputs + 3 * sees
+    means, directions = torch.rand(20, 3), torch.nn.functional.normalize(torch.randn(20, 3), dim=1)
+    assert torch.allclose(net(means, directions), net(means, -directions)) is not sees
+
+
+def test_the_grid_of_color_net_is_that_of_the_configuration():
+    """Every number of it, over a box whose sides all go from 0 to 1."""
+    config = replace(
+        tiny_config().appearance.color_net, levels=3, base_resolution=5, max_resolution=40, log2_table_size=9
+    )
+    low, high = torch.tensor([-1.0, 0.5, 2.0]), torch.tensor([1.0, 4.5, 2.5])
+    net = ColorNet(low, high, config, seed=0)
+    assert net.grid.shape == HashGridShape(levels=3, base_resolution=5, max_resolution=40, log2_table_size=9)
+    given: list[Tensor] = []
+    net.grid.register_forward_pre_hook(lambda module, inputs: given.append(inputs[0]))
+    net(torch.stack([low, high, (low + high) / 2]), torch.zeros(3, 3))
+    assert torch.allclose(given[0], torch.tensor([[0.0], [1.0], [0.5]]).expand(3, 3), atol=1e-6)
 
 
 def test_color_net_encodes_places_on_the_canonical_head(subject, views):

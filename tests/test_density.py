@@ -185,6 +185,16 @@ def test_faint_gaussians_go_but_no_face_is_left_bare():
         assert torch.equal(value, expected[name][[2, 3, 4, 5, 6, 7]]), name
 
 
+@pytest.mark.parametrize(("opacity", "stays"), [(0.0051, True), (0.0049, False)])
+def test_the_threshold_of_opacity(opacity, stays):
+    """Beside an opaque Gaussian on its face, the configured opacity decides."""
+    scene = Scene(min_opacity=0.005)
+    scene.refine([HUGE] + [0.0] * 5)
+    scene.set_opacity(0, opacity)
+    scene.refine([0.0] * 7)
+    assert (len(scene.gaussians) == 7) is stays
+
+
 def test_of_equally_faint_ones_the_first_stays():
     """Ties are broken by index, so runs repeat."""
     scene = Scene()
