@@ -15,6 +15,7 @@ from torch.utils._pytree import tree_leaves
 
 from mgavatar.appearance.model import build_appearance
 from mgavatar.appearance.stage import AppearanceStage
+from mgavatar.config import HeadTuningConfig
 from mgavatar.fitting.stage import Stage
 from mgavatar.geometry.stage import GeometryStage
 from mgavatar.geometry.vertex_gaussians import VertexGaussians
@@ -92,18 +93,19 @@ def test_frames_get_the_same_gradient_from_many_gaussians(prepared, rng):
 
 
 def _stage(name: str, subject: Any) -> Stage:
-    config = tiny_config()
+    baseline = {"colors": "sh", "head_tuning": HeadTuningConfig(enabled=True)}
+    config = tiny_config(appearance=baseline if name == "baseline" else None)
     head = tiny_personal_head(subject, config)
     if name == "geometry":
         return GeometryStage(VertexGaussians(head, config), config)
     return AppearanceStage(build_appearance(head, config, seed=0), config, seed=0)
 
 
-@pytest.mark.parametrize("name", ["geometry", "appearance"])
+@pytest.mark.parametrize("name", ["geometry", "appearance", "baseline"])
 def test_a_step_uses_deterministic_operations_only(name, subject, views, deterministic):
     """Torch raises at those that it knows on this device; the recorded names cover the devices that are not here."""
     stage = _stage(name, subject)
     with Recorder() as recorder:
-        run(stage, views, 1)
+        run(stage, views, 5)  # with a round of density control
     assert {"mul", "cat"} <= recorder.names, "nothing was recorded"
     assert recorder.names & ADDS_IN_ANY_ORDER == set()
