@@ -187,7 +187,7 @@ def render(
         camera: mean, train:ID, orbit, or a .json with the keys of a transforms frame.
         head_motion: Take the root's motion as driven (full), put it into the neck (neck), or take none.
         expression: Use the expression columns if their basis is the head's (auto), always (use), or ignore them.
-        expression_map: Map from ARKit's blendshapes to the avatar's head; by default by the names of its directions.
+        expression_map: Map from ARKit's blendshapes to the avatar's head; by default by names, else computed.
         format: Format of single frames, or mp4; by default as --out says.
         size: Image size, WIDTHxHEIGHT; the camera's own by default.
         frames: Frames to draw, START:STOP or START:STOP:STEP, counted from 0.
@@ -197,7 +197,7 @@ def render(
     """
     from mgavatar.avatar import Avatar
     from mgavatar.device import find_device
-    from mgavatar.driving.expression_map import read_expression_map
+    from mgavatar.driving.map_expressions import map_for
     from mgavatar.driving.read import read_driving
     from mgavatar.driving.render import render as run_render
     from mgavatar.driving.writers import default_name, kind_of
@@ -213,8 +213,8 @@ def render(
             raise DataError(f"--fps {fps:g}: must lie between 0 and 1000")
         motion = dataclasses.replace(motion, fps=fps)
     loaded = Avatar.load(avatar, device=find_device(device))
-    n_expr = loaded.head_model.n_expr
-    mapped = read_expression_map(expression_map, n_expr=n_expr) if expression_map is not None else None
+    mapped, note = map_for(motion, loaded.head_model, given=expression_map, avatar=avatar)
+    _say_all([note] if note else [])
     with Reporter("render", len(motion)) as reporter:
         notes = run_render(
             loaded,
@@ -270,6 +270,33 @@ def export(
     loaded = Avatar.load(avatar, device=find_device(device))
     notes = run_export(loaded, out, to=content, pose=pose, driving=motion, degree=degree, up=up, overwrite=overwrite)
     _say_all(notes)
+    print(out)
+
+
+def map_expressions(*, head_model: str, out: Path) -> None:
+    """Compute a map from ARKit's blendshapes to a head's own expression directions, jaw and eyes.
+
+    Args:
+        head_model: FLAME .pkl or head .npz, or builtin.
+        out: The map, ending in .npz, for `render --expression-map`.
+    """
+    from mgavatar.driving.expression_map import write_expression_map
+    from mgavatar.driving.map_expressions import map_expressions as compute
+    from mgavatar.files import check_writable
+    from mgavatar.head.find import load_head_model
+    from mgavatar.progress import Reporter
+
+    if out.suffix.lower() != ".npz":
+        raise DataError(f"{out}: the name of a map must end in .npz")
+    check_writable(out)
+    head = load_head_model(head_model)
+    with Reporter("map-expressions", 52) as reporter:
+        mapped = compute(head, progress=lambda done, total: reporter.update(done, total=total))
+    write_expression_map(out, mapped)
+    print("mean distance from the built-in head's motion:")
+    for name, residual in zip(mapped.names, mapped.residual_mm, strict=True):
+        found = "nothing of it" if name in mapped.unmapped else f"{residual:.2f} mm" if residual >= 0.0 else "eyes"
+        print(f"{name:20} {found}")
     print(out)
 
 
@@ -376,6 +403,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "fit": fit,
     "render": render,
     "export": export,
+    "map-expressions": map_expressions,
     "evaluate": evaluate,
     "bench": bench,
 }

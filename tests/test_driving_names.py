@@ -160,7 +160,7 @@ def test_a_neutral_face_still_moves_jaw_and_eyes(tmp_path):
     assert moved.eyes_pose.any()
 
 
-def test_a_head_without_names_needs_a_map(tmp_path):
+def test_a_head_without_names_and_without_a_face_needs_a_map(tmp_path):
     with pytest.raises(DataError, match="give --expression-map FILE"):
         expression_on(driven(tmp_path, "jawOpen"), ball_head())
 

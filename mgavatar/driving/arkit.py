@@ -59,6 +59,11 @@ def n_arkit_names(names: Sequence[str]) -> int:
     return len({arkit_name(name) for name in names} - {None})
 
 
+def is_arkit(driving: Driving) -> bool:
+    """Return True if the expression columns are ARKit's blendshapes, by their names."""
+    return driving.expr_basis == BASIS or n_arkit_names(driving.expr_names) >= max(FEWEST_NAMES, driving.expr.shape[1])
+
+
 @dataclass(frozen=True)
 class Weights:
     """Weights of named blendshapes over T frames, as a file has them.

@@ -10,10 +10,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mgavatar.avatar import Avatar
-from mgavatar.driving.arkit import BASIS, FEWEST_NAMES, arkit_name, n_arkit_names
+from mgavatar.driving.arkit import arkit_name, is_arkit
 from mgavatar.driving.expression_map import ExpressionMap, listed, map_by_names
+from mgavatar.driving.map_expressions import computed_map
 from mgavatar.driving.motion import Driving
-from mgavatar.errors import DataError
 from mgavatar.head.model import HeadModel
 from mgavatar.head.params import Pose
 
@@ -113,17 +113,13 @@ class HeadExpression:
     notes: tuple[str, ...]
 
 
-def is_arkit(driving: Driving) -> bool:
-    """Return True if the expression columns are ARKit's blendshapes, by their names."""
-    return driving.expr_basis == BASIS or n_arkit_names(driving.expr_names) >= max(FEWEST_NAMES, driving.expr.shape[1])
-
-
 def expression_on(
     driving: Driving, model: HeadModel, *, mode: ExpressionMode = "auto", expression_map: ExpressionMap | None = None
 ) -> HeadExpression:
     """Return the expression, jaw and eyes that a motion gives a head.
 
-    ARKit's blendshapes go through a map: the one given, or that of the head's names. The motion's own jaw adds to that
+    ARKit's blendshapes go through a map: the one given, or that of the head's names, or else one that is computed from
+    its surface. The motion's own jaw adds to that
     of the map; its own eyes, where a file has angles, take the place of those of the map. Everything else is taken as
     :func:`driving_expression` says.
 
@@ -134,19 +130,14 @@ def expression_on(
         expression_map: Map from ARKit's blendshapes to the head.
 
     Raises:
-        DataError: If the motion has blendshapes and there is no map for the head.
+        DataError: If the motion has blendshapes and no map to the head can be computed.
     """
     if not is_arkit(driving):
         expr, note = driving_expression(
             driving, n_expr=model.n_expr, expr_basis=model.expr_basis, expr_names=model.expr_names, mode=mode
         )
         return HeadExpression(expr, driving.jaw_pose, driving.eyes_pose, (note,) if note else ())
-    mapped = expression_map or map_by_names(model)
-    if mapped is None:
-        raise DataError(
-            f"{driving.path}: holds ARKit's blendshapes, but {model.name} names no directions for them; give "
-            "--expression-map FILE"
-        )
+    mapped = expression_map or map_by_names(model) or computed_map(model)
     names = [arkit_name(name) or name for name in driving.expr_names]
     expr, jaw, eyes = mapped.apply(names, driving.expr)
     if mode == "ignore":
