@@ -419,12 +419,19 @@ def test_splitting_at_seams_splits_nothing_else(avatar):
     assert np.array_equal(corners[faces][:, :, 0], mesh.faces)
 
 
-def test_the_colours_of_a_mesh_are_those_of_the_gaussians_around(avatar, plain):
-    """All of one colour give that colour; without an appearance it is the vertex's own."""
+def test_the_colours_of_a_mesh_are_those_of_its_vertices(avatar, plain):
+    """With an appearance and without."""
     assert np.allclose(bake_mesh(plain, plain.mean_pose()).colors, COLOR, atol=1e-5)
+    expected = (0.5 + 0.28209479177387814 * avatar.vertex_gaussians.colors).clamp(0.0, 1.0)
+    assert np.allclose(bake_mesh(avatar, avatar.mean_pose()).colors, expected.numpy(), atol=1e-6)
+
+
+def test_the_colours_of_a_mesh_without_a_geometry_stage():
+    """They are those of the Gaussians around: all of one colour give that colour."""
     own = Avatar.load(DATA / "format2_sh.pt")
     assert own.appearance is not None
     own.appearance.offset_net = None
+    own.vertex_gaussians.colors.zero_()
     own.appearance.gaussians.sh_others.zero_()
     own.appearance.gaussians.sh_constant.copy_(
         torch.tensor([0.5, -0.5, 0.1]).expand_as(own.appearance.gaussians.sh_constant)

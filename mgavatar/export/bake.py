@@ -157,7 +157,7 @@ def _solved(basis: Tensor, weights: np.ndarray, sums: Tensor, degree: int) -> Te
 
 @torch.no_grad()
 def bake_mesh(avatar: Avatar, pose: Pose) -> Mesh:
-    """Return the personal mesh in a pose, coloured as the Gaussians around each vertex are on average.
+    """Return the personal mesh in a pose, with the colours that the geometry stage gave its vertices.
 
     Args:
         avatar: The avatar.
@@ -179,11 +179,12 @@ def bake_mesh(avatar: Avatar, pose: Pose) -> Mesh:
 def _vertex_colors(avatar: Avatar, pose: Pose) -> Tensor:
     """Return a colour for every vertex, shape [V, 3].
 
-    It is that of the vertex-bound Gaussian, or the mean over the Gaussians of all faces around it, weighted by their
-    opacity and cross-section.
+    Vertex-bound Gaussians are opaque and lie on the mesh, so their colours are its own. Where a fit had no geometry
+    stage, which leaves them grey, it is the mean over the Gaussians of all faces around a vertex, weighted by opacity
+    and cross-section: a blurred picture, because several transparent layers make up what the avatar shows.
     """
     own = 0.5 + SH_C0 * avatar.vertex_gaussians.colors
-    if avatar.appearance is None:
+    if avatar.appearance is None or bool(avatar.vertex_gaussians.colors.any()):
         return own
     flat = bake_splats(avatar, pose, degree=0)[0]
     largest = flat.scales.topk(2, dim=1).values
@@ -191,7 +192,7 @@ def _vertex_colors(avatar: Avatar, pose: Pose) -> Tensor:
     weights = weights / weights.mean().clamp(min=1e-30)
     colors = 0.5 + SH_C0 * flat.sh[:, 0]
     corners = avatar.head.body.faces.long()[avatar.appearance.gaussians.face_ids]
-    # A vertex without a Gaussian around it keeps the colour of the geometry stage.
+    # A vertex without a Gaussian around it stays grey.
     total = torch.full((len(own), 4), 1e-6, device=own.device) * torch.cat([own, torch.ones_like(own[:, :1])], 1)
     rows = torch.cat([colors, torch.ones_like(colors[:, :1])], 1) * weights[:, None]
     for corner in range(3):
