@@ -238,23 +238,25 @@ def export(
     *,
     avatar: Path,
     out: Path,
-    to: Literal["auto", "splats", "mesh"] = "auto",
+    to: Literal["auto", "splats", "mesh", "rig"] = "auto",
     pose: str = "neutral",
     driving: Path | None = None,
     degree: Literal[0, 1, 2, 3] = 3,
+    morphs: int = 50,
     up: Literal["y", "-y"] = "y",
     overwrite: bool = False,
     device: str = "auto",
 ) -> None:
-    """Write an avatar in one pose for other programs, as splats or as a coloured mesh.
+    """Write an avatar for other programs: splats or a coloured mesh in one pose, or a rig that can be posed.
 
     Args:
         avatar: The avatar, or the folder of its fit.
-        out: FILE.ply (splats, or a mesh), FILE.glb (a mesh, or splats), FILE.obj or FILE.stl (a mesh).
-        to: What the file has, splats or mesh; by default as --out says.
+        out: FILE.ply (splats, or a mesh), FILE.glb (a mesh, splats, or a rig), FILE.obj or FILE.stl (a mesh).
+        to: What the file has, splats, mesh or rig; by default as --out says.
         pose: neutral, mean, or a frame counted from 0: of --driving, or of the capture.
-        driving: Motion that the frame is of, as in render.
+        driving: Motion that the frame is of, or the animation of a rig; files as in render.
         degree: Degree of the splats' spherical harmonics.
+        morphs: Largest number of a rig's expressions.
         up: Axis that points up in a .ply of splats; -y for viewers that turn such files.
         overwrite: Replace a file that is there already.
         device: auto, cpu, cuda or cuda:N.
@@ -268,7 +270,9 @@ def export(
     content = content_of(out, None if to == "auto" else to, up=up, overwrite=overwrite)
     motion = read_driving(driving) if driving is not None else None
     loaded = Avatar.load(avatar, device=find_device(device))
-    notes = run_export(loaded, out, to=content, pose=pose, driving=motion, degree=degree, up=up, overwrite=overwrite)
+    notes = run_export(
+        loaded, out, to=content, pose=pose, driving=motion, degree=degree, morphs=morphs, up=up, overwrite=overwrite
+    )
     _say_all(notes)
     print(out)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from tiny_avatar import COLOR, tiny_avatar
 
@@ -36,6 +37,7 @@ from mgavatar.export.export import export, export_pose
 from mgavatar.export.glb import Glb
 from mgavatar.export.mesh_glb import split_at_seams
 from mgavatar.export.ply import write_splats_ply
+from mgavatar.export.rig import bake_rig, rig_error
 from mgavatar.gaussians import draw
 
 DATA = Path(__file__).parent / "data"
@@ -104,7 +106,7 @@ def splats_of_ply(rows: np.ndarray) -> Splats:
 
 
 COMPONENTS = {5126: "<f4", 5125: "<u4", 5121: "<u1"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def read_glb(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
@@ -137,6 +139,7 @@ def read_glb(path: Path) -> tuple[dict[str, Any], list[np.ndarray]]:
         assert accessor["count"] >= 1
         assert np.isfinite(array).all()
         if "min" in accessor:
+            assert isinstance(accessor["min"], list)
             assert np.array_equal(np.float32(accessor["min"]), array.min(0))
             assert np.array_equal(np.float32(accessor["max"]), array.max(0))
         arrays.append(array)
@@ -438,6 +441,127 @@ def test_the_colours_of_a_mesh_without_a_geometry_stage():
     )
     colors = bake_mesh(own, own.mean_pose()).colors
     assert np.allclose(colors, 0.5 + 0.28209479177387814 * np.array([0.5, -0.5, 0.1]), atol=1e-4)
+
+
+# ---- rigs ----
+
+
+def gltf_pose(path: Path, *, frame: int | None = None) -> np.ndarray:
+    """Pose the mesh of a GLB as glTF says, at rest or at a frame of its animation, and return its vertices."""
+    tree, arrays = read_glb(path)
+    nodes = [dict(node) for node in tree["nodes"]]
+    mesh, (primitive,) = tree["meshes"][0], tree["meshes"][0]["primitives"]
+    weights = np.array(mesh.get("weights", ()))
+    if frame is not None:
+        animation = tree["animations"][0]
+        for channel in animation["channels"]:
+            sampler, target = animation["samplers"][channel["sampler"]], channel["target"]
+            times = arrays[sampler["input"]]
+            values = arrays[sampler["output"]].reshape(len(times), -1)[frame]
+            nodes[target["node"]][target["path"]] = values
+            weights = values if target["path"] == "weights" else weights
+    attributes = {name: arrays[index].astype(float) for name, index in primitive["attributes"].items()}
+    verts = attributes["POSITION"].copy()
+    for weight, morph in zip(weights, primitive.get("targets", ()), strict=True):
+        verts += weight * arrays[morph["POSITION"]]
+    world: dict[int, np.ndarray] = {}
+
+    def place(index: int, above: np.ndarray) -> None:
+        local = np.eye(4)
+        local[:3, :3] = Rotation.from_quat(nodes[index].get("rotation", (0, 0, 0, 1))).as_matrix()
+        local[:3, 3] = nodes[index].get("translation", (0, 0, 0))
+        world[index] = above @ local
+        for child in nodes[index].get("children", ()):
+            place(child, world[index])
+
+    for root in tree["scenes"][0]["nodes"]:
+        place(root, np.eye(4))
+    skin = tree["skins"][0]
+    inverse = arrays[skin["inverseBindMatrices"]].reshape(-1, 4, 4).transpose(0, 2, 1)
+    matrices = np.stack([world[joint] for joint in skin["joints"]]) @ inverse
+    joints, shares = attributes["JOINTS_0"].astype(int), attributes["WEIGHTS_0"]
+    assert np.allclose(shares.sum(1), 1.0, atol=1e-6)
+    assert not joints[shares == 0.0].any()
+    blended = np.einsum("vk,vkij->vij", shares, matrices[joints])
+    return np.einsum("vij,vj->vi", blended[:, :3, :3], verts) + blended[:, :3, 3]
+
+
+@pytest.fixture
+def moving(avatar: Avatar, tmp_path: Path) -> Driving:
+    """Four frames in which everything moves; neck and jaw turn beyond half a turn of their quaternions' sign."""
+    rng = np.random.default_rng(5)
+    widths = {"expr": avatar.head_model.n_expr, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
+    rows = {name: rng.normal(0.0, 0.4, (4, width)).astype(np.float32) for name, width in widths.items()}
+    rows["rotation"][:, 1] = [2.9, 3.1, 3.3, 3.5]
+    rows["translation"] = rng.normal(0.0, 0.2, (4, 3)).astype(np.float32)
+    np.savez(tmp_path / "moving.npz", **rows, fps=10.0, expr_basis=avatar.head_model.expr_basis)
+    return read_driving(tmp_path / "moving.npz")
+
+
+def test_a_rig_is_the_avatar_where_that_is_linear(moving, tmp_path):
+    """Posed as glTF says, it is the head: at every frame, and in the pose of its nodes."""
+    avatar = tiny_avatar(tmp_path)[0]
+    body = avatar.head.body
+    body.has_pose_dirs = False  # a rig cannot hold correctives by pose, and no more than four weights per vertex
+    body.lbs_weights[:, 4] = 0.0
+    body.lbs_weights /= body.lbs_weights.sum(1, keepdim=True)
+    notes = export(avatar, tmp_path / "a.glb", to="rig", driving=moving, pose="mean")
+    corners, _ = split_at_seams(bake_mesh(avatar, avatar.mean_pose()))
+    poses = poses_of(avatar, moving)
+    for frame, pose in [(None, avatar.mean_pose()), *enumerate(poses)]:
+        found = gltf_pose(tmp_path / "a.glb", frame=frame)
+        assert np.abs(found - avatar.verts(pose).numpy()[corners[:, 0]]).max() < 1e-5
+    assert any("rig with 3 expressions: 0.00 mm from the avatar over poses of the motion" in note for note in notes)
+
+
+def test_a_rig_in_a_file_is_the_baked_one(plain, moving, tmp_path):
+    """Also where a vertex has more weights than a file may hold."""
+    export(plain, tmp_path / "a.glb", to="rig", driving=moving)
+    rig = bake_rig(plain, n_expr=50)
+    assert int((rig.weights > 0.0).sum(1).max()) <= 4
+    corners, _ = split_at_seams(bake_mesh(plain, plain.mean_pose()))
+    for frame, pose in enumerate(poses_of(plain, moving)):
+        found = gltf_pose(tmp_path / "a.glb", frame=frame)
+        assert np.abs(found - rig.posed(pose).numpy()[corners[:, 0]]).max() < 1e-5
+
+
+def test_the_error_of_a_rig_is_that_of_its_correctives(plain):
+    """In millimetres, over vertices and poses."""
+    rig = bake_rig(plain, n_expr=50)
+    pose = plain.head.pose(0)
+    distances = 1000.0 * (rig.posed(pose) - plain.verts(pose)).norm(dim=1)
+    mean, largest = rig_error(plain, rig, [pose])
+    assert mean == pytest.approx(float(distances.mean()))
+    assert largest == pytest.approx(float(distances.max()))
+    assert mean > 0.0
+
+
+def test_the_animation_of_a_rig(avatar, moving, tmp_path):
+    """One sampler per joint, one for the place and one for the expression; times in seconds; no jump of a sign."""
+    export(avatar, tmp_path / "a.glb", to="rig", driving=moving)
+    tree, arrays = read_glb(tmp_path / "a.glb")
+    (animation,) = tree["animations"]
+    assert len(animation["channels"]) == len(animation["samplers"]) == 7
+    times = arrays[animation["samplers"][0]["input"]]
+    assert np.allclose(times[:, 0], [0.0, 0.1, 0.2, 0.3])
+    turns = arrays[animation["samplers"][0]["output"]]
+    assert (turns[1:] * turns[:-1]).sum(1).min() > 0.9
+    names = tree["meshes"][0]["extras"]["targetNames"]
+    assert len(names) == len(tree["meshes"][0]["weights"]) == min(50, avatar.head_model.n_expr)
+    assert [tree["nodes"][joint]["name"] for joint in tree["skins"][0]["joints"]] == [
+        "root", "neck", "jaw", "left_eye", "right_eye",
+    ]  # fmt: skip
+
+
+def test_a_rig_with_fewer_expressions(avatar, tmp_path):
+    """The first ones; none at all leaves a skin alone, and without a motion there is no animation."""
+    for n in (0, 2):
+        export(avatar, tmp_path / f"{n}.glb", to="rig", morphs=n)
+        tree, _ = read_glb(tmp_path / f"{n}.glb")
+        assert len(tree["meshes"][0].get("weights", ())) == n
+        assert "animations" not in tree
+    with pytest.raises(DataError, match="--morphs -1"):
+        export(avatar, tmp_path / "a.glb", to="rig", morphs=-1)
 
 
 # ---- poses ----

@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from mgavatar import __version__
 from mgavatar.avatar import Avatar
-from mgavatar.driving.motion import Driving
+from mgavatar.driving.motion import DEFAULT_FPS, Driving
 from mgavatar.driving.retarget import driving_notes, poses_of
 from mgavatar.errors import DataError
 from mgavatar.export.bake import Splats, bake_mesh, bake_splats, baking_costs
 from mgavatar.export.mesh_files import write_obj, write_with_trimesh
 from mgavatar.export.mesh_glb import write_mesh_glb
 from mgavatar.export.ply import write_splats_ply
+from mgavatar.export.rig import Rig, bake_rig, rig_error, training_poses
+from mgavatar.export.rig_glb import write_rig_glb
 from mgavatar.export.splats_glb import write_splats_glb
 from mgavatar.files import check_writable
 from mgavatar.head.params import HeadParams, Pose
 
-Content = Literal["splats", "mesh"]
+Content = Literal["splats", "mesh", "rig"]
 Up = Literal["y", "-y"]
 
 CONTENTS: dict[str, tuple[Content, ...]] = {
     ".ply": ("splats", "mesh"),
-    ".glb": ("mesh", "splats"),
+    ".glb": ("mesh", "splats", "rig"),
     ".obj": ("mesh",),
     ".stl": ("mesh",),
 }
 """Contents that a file can have, by its suffix; the first one is the default."""
+
+MORPHS = 50
+"""Number of a rig's expressions by default."""
 
 CONVERTED = (".sog", ".spz", ".splat", ".ksplat")
 """Suffixes of other formats of splats, which a converter makes of a PLY."""
@@ -74,18 +81,20 @@ def export(
     pose: str = "neutral",
     driving: Driving | None = None,
     degree: int = 3,
+    morphs: int = MORPHS,
     up: Up = "y",
     overwrite: bool = False,
 ) -> list[str]:
-    """Write an avatar in one pose for another program: splats or a coloured mesh.
+    """Write an avatar for another program: splats or a coloured mesh in one pose, or a rig that can be posed.
 
     Args:
         avatar: The avatar.
         out: A name ending in ``.ply``, ``.glb``, ``.obj`` or ``.stl``.
-        to: ``"splats"`` or ``"mesh"``; by default splats in a ``.ply`` and the mesh in other files.
+        to: ``"splats"``, ``"mesh"`` or ``"rig"``; by default splats in a ``.ply`` and the mesh in other files.
         pose: ``"neutral"``, ``"mean"`` or the number of a frame; see :func:`export_pose`.
-        driving: Motion that the frame is of.
+        driving: Motion that the frame is of, or a rig's animation.
         degree: Degree of the splats' spherical harmonics, 0 to 3.
+        morphs: Largest number of a rig's expressions.
         up: Axis of the file that points upwards; ``"-y"`` for splats in a ``.ply`` only.
         overwrite: Replace a file that is there already.
 
@@ -97,11 +106,15 @@ def export(
     """
     out = Path(out)
     content = content_of(out, to, up=up, overwrite=overwrite)
-    chosen, posed_as = export_pose(avatar, pose, driving)
+    if morphs < 0:
+        raise DataError(f"--morphs {morphs}: give a number of expressions, 0 or more")
+    chosen, posed_as = export_pose(avatar, pose, None if content == "rig" else driving)
     facts: dict[str, Any] = {"mgavatar": __version__, "pose": posed_as, "unit": "metre", "up": up}
     notes = driving_notes(avatar, driving) if driving is not None else []
     if avatar.appearance is None:
         notes.append("the avatar has no appearance stage: the colours are those of its vertex-bound Gaussians")
+    if content == "rig":
+        return [*notes, _write_rig(out, avatar, chosen, driving, morphs, facts)]
     if content == "mesh":
         _write_mesh(out, avatar, chosen, facts)
         return notes
@@ -151,6 +164,26 @@ def _write_mesh(out: Path, avatar: Avatar, pose: Pose, facts: dict[str, Any]) ->
         write_obj(out, mesh, comments=_comments(facts))
     else:
         write_with_trimesh(out, mesh)
+
+
+def _write_rig(
+    out: Path, avatar: Avatar, pose: Pose, driving: Driving | None, morphs: int, facts: dict[str, Any]
+) -> str:
+    """Write a rig and return the line about its error."""
+    rig = bake_rig(avatar, n_expr=morphs)
+    motion = poses_of(avatar, driving) if driving is not None else []
+    mean, largest = rig_error(avatar, rig, motion or training_poses(avatar))
+    rest = replace(bake_mesh(avatar, pose), verts=rig.verts.cpu().numpy(), normals=_normals(avatar, rig))
+    facts |= {"mean_mm_from_the_avatar": round(mean, 3), "largest_mm_from_the_avatar": round(largest, 3)}
+    fps = driving.fps if driving is not None else DEFAULT_FPS
+    write_rig_glb(out, rest, rig, pose, motion=motion, fps=fps, extras=facts)
+    whose = "of the motion" if motion else "of the capture"
+    n = len(rig.expr_dirs)
+    return f"rig with {n} expressions: {mean:.2f} mm from the avatar over poses {whose}, at most {largest:.1f} mm"
+
+
+def _normals(avatar: Avatar, rig: Rig) -> np.ndarray:
+    return avatar.head.body.normals(rig.verts).cpu().numpy()
 
 
 def _write_splats(out: Path, splats: Splats, facts: dict[str, Any], up: Up) -> None:

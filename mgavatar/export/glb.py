@@ -61,8 +61,8 @@ class Glb:
             view["target"] = target
         accessor = {"componentType": component, "count": len(values), "type": kind}
         if bounds:
-            # As float32 numbers are stored: the reader compares bit for bit.
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+            rows = values.reshape(len(values), -1)  # a list of one number for scalars too
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         self._data += values.astype(values.dtype.newbyteorder("<")).tobytes()
         self._data += bytes(-len(self._data) % 4)
         views, accessors = self.tree.setdefault("bufferViews", []), self.tree.setdefault("accessors", [])

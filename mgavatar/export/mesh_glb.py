@@ -27,6 +27,12 @@ def write_mesh_glb(path: Path, mesh: Mesh, *, extras: dict[str, Any]) -> None:
         DataError: If the file cannot be written.
     """
     glb = Glb(extras)
+    add_mesh(glb, mesh)
+    glb.write(path)
+
+
+def add_mesh(glb: Glb, mesh: Mesh) -> np.ndarray:
+    """Add a scene with a node that has the mesh, and return the vertex that each of the file's vertices is."""
     corners, faces = split_at_seams(mesh)
     verts, texture = corners.T
     attributes = {
@@ -43,7 +49,7 @@ def write_mesh_glb(path: Path, mesh: Mesh, *, extras: dict[str, Any]) -> None:
         "meshes": [{"name": "head", "primitives": [primitive]}],
         "materials": [{"name": "colors", "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}],
     }
-    glb.write(path)
+    return verts
 
 
 def split_at_seams(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
