@@ -174,6 +174,7 @@ def render(
     format: Literal["auto", "png", "exr", "mp4"] = "auto",
     size: str | None = None,
     frames: str | None = None,
+    background: str | None = None,
     fps: float | None = None,
     overwrite: bool = False,
     device: str = "auto",
@@ -191,6 +192,7 @@ def render(
         format: Format of single frames, or mp4; by default as --out says.
         size: Image size, WIDTHxHEIGHT; the camera's own by default.
         frames: Frames to draw, START:STOP or START:STOP:STEP, counted from 0.
+        background: white, black, R,G,B, or transparent for PNG with alpha; the capture's own by default.
         fps: Frames per second of the video; by default as the motion says, else 25.
         overwrite: Replace a video that is there already.
         device: auto, cpu, cuda or cuda:N.
@@ -199,6 +201,7 @@ def render(
     from mgavatar.device import find_device
     from mgavatar.driving.map_expressions import map_for
     from mgavatar.driving.read import read_driving
+    from mgavatar.driving.render import backdrop
     from mgavatar.driving.render import render as run_render
     from mgavatar.driving.writers import default_name, kind_of
     from mgavatar.progress import Reporter
@@ -206,7 +209,7 @@ def render(
     pixels = _size(size) if size else None
     chosen = _slice(frames) if frames else None
     target = out if out is not None else default_name(driving, format)
-    kind_of(target, format, overwrite=overwrite)
+    backdrop(target, kind_of(target, format, overwrite=overwrite), background)
     motion = read_driving(driving)
     if fps is not None:
         if not 0.0 < fps <= 1000.0:
@@ -227,6 +230,7 @@ def render(
             format=format,
             size=pixels,
             frames=chosen,
+            background=background,
             overwrite=overwrite,
             progress=lambda done, total: reporter.update(done, total=total),
         )
@@ -241,6 +245,7 @@ def export(
     to: Literal["auto", "splats", "mesh", "rig"] = "auto",
     pose: str = "neutral",
     driving: Path | None = None,
+    expression_map: Path | None = None,
     degree: Literal[0, 1, 2, 3] = 3,
     morphs: int = 50,
     up: Literal["y", "-y"] = "y",
@@ -255,6 +260,7 @@ def export(
         to: What the file has, splats, mesh or rig; by default as --out says.
         pose: neutral, mean, or a frame counted from 0: of --driving, or of the capture.
         driving: Motion that the frame is of, or the animation of a rig; files as in render.
+        expression_map: As in render.
         degree: Degree of the splats' spherical harmonics.
         morphs: Largest number of a rig's expressions.
         up: Axis that points up in a .ply of splats; -y for viewers that turn such files.
@@ -263,6 +269,7 @@ def export(
     """
     from mgavatar.avatar import Avatar
     from mgavatar.device import find_device
+    from mgavatar.driving.map_expressions import map_for
     from mgavatar.driving.read import read_driving
     from mgavatar.export.export import content_of
     from mgavatar.export.export import export as run_export
@@ -270,8 +277,21 @@ def export(
     content = content_of(out, None if to == "auto" else to, up=up, overwrite=overwrite)
     motion = read_driving(driving) if driving is not None else None
     loaded = Avatar.load(avatar, device=find_device(device))
+    mapped = None
+    if motion is not None:
+        mapped, note = map_for(motion, loaded.head_model, given=expression_map, avatar=avatar)
+        _say_all([note] if note else [])
     notes = run_export(
-        loaded, out, to=content, pose=pose, driving=motion, degree=degree, morphs=morphs, up=up, overwrite=overwrite
+        loaded,
+        out,
+        to=content,
+        pose=pose,
+        driving=motion,
+        expression_map=mapped,
+        degree=degree,
+        morphs=morphs,
+        up=up,
+        overwrite=overwrite,
     )
     _say_all(notes)
     print(out)

@@ -21,6 +21,7 @@ from mgavatar import cli
 from mgavatar.appearance.spherical_harmonics import sh_basis
 from mgavatar.avatar import Avatar
 from mgavatar.camera import look_at
+from mgavatar.driving.expression_map import ExpressionMap
 from mgavatar.driving.motion import Driving
 from mgavatar.driving.read import read_driving
 from mgavatar.driving.retarget import poses_of
@@ -39,6 +40,7 @@ from mgavatar.export.mesh_glb import split_at_seams
 from mgavatar.export.ply import write_splats_ply
 from mgavatar.export.rig import bake_rig, rig_error
 from mgavatar.gaussians import draw
+from mgavatar.head.params import HeadParams
 
 DATA = Path(__file__).parent / "data"
 SPLAT_COLUMNS = (
@@ -577,6 +579,22 @@ def test_poses_by_their_names(avatar, driving):
     assert name == "frame 2 of motion.npz"
     own, _ = export_pose(avatar, "1")
     assert torch.equal(own.rotation, avatar.head.poses["rotation"][1])
+
+
+def test_blendshapes_need_a_map_and_take_it(avatar, tmp_path):
+    """As in a rendering: a frame of ARKit's blendshapes goes through the map that is given."""
+    motion = Driving(
+        **vars(HeadParams.neutral(n_frames=2, n_expr=1)) | {"expr": np.array([[0.0], [0.5]], np.float32)},
+        expr_basis="arkit",
+        expr_names=("jawOpen",),
+        path=tmp_path / "phone.csv",
+    )
+    zeros = np.zeros((1, avatar.head_model.n_expr), np.float32)
+    given = ExpressionMap(("jawOpen",), zeros, np.array([[0.4, 0.0, 0.0]], np.float32), np.zeros((1, 6)), np.zeros(1))
+    pose, _ = export_pose(avatar, "1", motion, expression_map=given)
+    assert float(pose.jaw_pose[0]) == pytest.approx(0.2)
+    export(avatar, tmp_path / "a.glb", to="rig", driving=motion, expression_map=given)
+    assert len(read_glb(tmp_path / "a.glb")[0]["animations"]) == 1
 
 
 @pytest.mark.parametrize(

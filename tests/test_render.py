@@ -33,6 +33,38 @@ from mgavatar.kernels.rasterize import Rendering
 N = 5
 
 
+def test_backgrounds_of_a_rendering(avatar: Avatar, driving: Driving, tmp_path: Path) -> None:
+    """Another colour where nothing is; with alpha, the picture over any colour is the one drawn over it."""
+    one = slice(0, 1)
+    for name, background in (("own", None), ("green", "0,255,0"), ("alpha", "transparent")):
+        render(avatar, driving, out=tmp_path / name, frames=one, background=background)
+    own, green, alpha = (np.asarray(Image.open(tmp_path / n / "00000.png")) for n in ("own", "green", "alpha"))
+    assert own[0, 0].tolist() == [255, 255, 255]
+    assert green[0, 0].tolist() == [0, 255, 0]
+    assert alpha.shape[2] == 4
+    assert alpha[0, 0].tolist() == [0, 0, 0, 0]
+    coverage = alpha[:, :, 3:] / 255.0
+    assert coverage.max() > 0.9
+    over_green = alpha[:, :, :3] * coverage + (1.0 - coverage) * np.array([0.0, 255.0, 0.0])
+    assert np.abs(over_green - green).max() < 2.0
+
+
+@pytest.mark.parametrize(
+    ("name", "format", "background", "words"),
+    [
+        ("a.gif", "auto", "transparent", "cannot be transparent; give --out a folder"),
+        ("frames", "exr", "white", "EXR has alpha and no background"),
+        ("frames", "png", "purple", "--background purple: must be white, black or R,G,B"),
+    ],
+)
+def test_backgrounds_that_are_refused(
+    name: str, format: str, background: str, words: str, avatar: Avatar, driving: Driving, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match=words):
+        render(avatar, driving, out=tmp_path / name, format=format, background=background)  # type: ignore[arg-type]
+    assert not (tmp_path / name).exists()
+
+
 @pytest.fixture(scope="module")
 def avatar(tmp_path_factory: pytest.TempPathFactory) -> Avatar:
     return tiny_avatar(tmp_path_factory.mktemp("render"))[0]

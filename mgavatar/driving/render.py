@@ -7,15 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mgavatar.avatar import Avatar
 from mgavatar.camera import Camera
+from mgavatar.config import background_color
 from mgavatar.driving.cameras import cameras_of
 from mgavatar.driving.expression_map import ExpressionMap
 from mgavatar.driving.motion import Driving
 from mgavatar.driving.retarget import ExpressionMode, HeadMotion, driving_notes, head_points, poses_of
-from mgavatar.driving.writers import Format, frame_writer, kind_of
+from mgavatar.driving.writers import FileKind, Format, frame_writer, kind_of
 from mgavatar.errors import DataError
+from mgavatar.files import one_line
 from mgavatar.head.params import Pose
 
 
@@ -31,6 +34,7 @@ def render(
     format: Format = "auto",
     size: tuple[int, int] | None = None,
     frames: slice | None = None,
+    background: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
@@ -47,6 +51,7 @@ def render(
         format: ``"auto"`` goes by the name of ``out``.
         size: Width and height [px]; the camera's own if None.
         frames: Frames to draw; all if None.
+        background: ``"white"``, ``"black"``, ``"R,G,B"`` or ``"transparent"``; the capture's own if None.
         overwrite: Replace a file of the same kind that is there already.
         progress: Called with the number of frames drawn and their total.
 
@@ -54,10 +59,12 @@ def render(
         Lines for the user: what of the driving sequence was not used.
 
     Raises:
-        DataError: If ``out`` cannot be written there, the camera is unknown, or no frame is left.
+        DataError: If ``out`` cannot be written there or cannot have the background, the camera is unknown, or no frame
+            is left.
     """
     out = Path(out)
     kind = kind_of(out, format, overwrite=overwrite)
+    behind = backdrop(out, kind, background)
     poses = poses_of(
         avatar,
         driving,
@@ -69,14 +76,40 @@ def render(
     if not poses:
         raise DataError(f"{driving.path}: no frames are left of its {len(driving)}; choose other frames")
     cameras = cameras_of(avatar, camera, n_frames=len(poses), size=size)
-    background = torch.zeros(3) if kind == "exr" else None
-    with frame_writer(out, kind, fps=driving.fps) as add:
+    with frame_writer(out, kind, fps=driving.fps, transparent=background == "transparent") as add:
         for index, (pose, view) in enumerate(zip(poses, cameras, strict=True)):
-            add(avatar.render(pose, view, background), view)
+            add(avatar.render(pose, view, behind), view)
             if progress is not None:
                 progress(index + 1, len(poses))
     notes = driving_notes(avatar, driving, expression=expression, expression_map=expression_map)
     return [*notes, *_view_notes(avatar, driving, poses, cameras)]
+
+
+def backdrop(out: Path, kind: FileKind, background: str | None) -> Tensor | None:
+    """Return the colour to draw frames over, shape [3]: black for those that keep alpha; None for the capture's own.
+
+    Args:
+        out: The file or folder.
+        kind: Its kind.
+        background: As in :func:`render`.
+
+    Raises:
+        DataError: If there is no such background, or files of this kind cannot have it.
+    """
+    if background == "transparent" and kind in ("mp4", "gif"):
+        raise DataError(f"{out}: a .{kind} cannot be transparent; give --out a folder, for PNG or EXR with alpha")
+    if kind == "exr":
+        if background not in (None, "transparent"):
+            raise DataError(f"{out}: EXR has alpha and no background; leave --background out")
+        return torch.zeros(3)
+    if background is None:
+        return None
+    if background == "transparent":
+        return torch.zeros(3)
+    try:
+        return torch.tensor(background_color(background))
+    except ValueError as error:
+        raise DataError(f"--background {one_line(background, limit=40)}: {error}, or transparent") from error
 
 
 def _view_notes(avatar: Avatar, driving: Driving, poses: list[Pose], cameras: list[Camera]) -> list[str]:

@@ -35,6 +35,9 @@ FrameSink = Callable[[Rendering, Camera], None]
 EMPTY_DEPTH = 1e10
 """Z of EXR pixels that show nothing [m]: finite, so that filters of compositing programs stay finite."""
 
+_LEAST_ALPHA = 1e-4
+"""Coverage below which a pixel shows nothing: its colour would be a quotient of roundings."""
+
 _MAGIC = {"mp4": (4, b"ftyp"), "gif": (0, b"GIF8")}
 
 _MEDIA = {".avi", ".bmp", ".exr", ".jpeg", ".jpg", ".m4v", ".mkv", ".mov", ".png", ".tif", ".tiff", ".webm", ".webp"}
@@ -116,13 +119,14 @@ def _first_bytes(path: Path) -> bytes:
 
 
 @contextlib.contextmanager
-def frame_writer(out: Path, kind: FileKind, *, fps: float) -> Iterator[FrameSink]:
+def frame_writer(out: Path, kind: FileKind, *, fps: float, transparent: bool = False) -> Iterator[FrameSink]:
     """Write frames beside ``out`` and move them there when the block ends without error.
 
     Args:
         out: File or folder to write; see :func:`kind_of`.
         kind: Kind of file.
         fps: Frames per second of a video.
+        transparent: Write PNG with alpha; its frames are drawn over black.
 
     Yields:
         A function that takes the next frame.
@@ -131,7 +135,8 @@ def frame_writer(out: Path, kind: FileKind, *, fps: float) -> Iterator[FrameSink
         DataError: If ``out`` cannot be written.
     """
     partial = out.with_name(f".{out.name}.{os.getpid()}.part")
-    writers = {"mp4": _mp4, "gif": _gif, "png": _png_folder, "exr": _exr_folder}
+    png = _rgba_folder if transparent else _png_folder
+    writers = {"mp4": _mp4, "gif": _gif, "png": png, "exr": _exr_folder}
     try:
         with writing(out):
             shutil.rmtree(partial, ignore_errors=True)
@@ -224,6 +229,26 @@ def _png_folder(path: Path, fps: float) -> Iterator[FrameSink]:
 
 
 @contextlib.contextmanager
+def _rgba_folder(path: Path, fps: float) -> Iterator[FrameSink]:
+    path.mkdir()
+    counter = _Counter()
+
+    def add(rendering: Rendering, camera: Camera) -> None:
+        pixels = to_bytes(straight_rgba(rendering))
+        Image.fromarray(pixels).save(path / f"{counter.next():05d}.png", compress_level=1)
+
+    yield add
+
+
+def straight_rgba(rendering: Rendering) -> Tensor:
+    """Return colours and coverage of a frame drawn over black, [4, H, W] in 0..1; PNG colours are not premultiplied."""
+    alpha = rendering.alphas.detach().clamp(0.0, 1.0)
+    covered = alpha > _LEAST_ALPHA
+    color = (rendering.image.detach() / alpha.where(covered, 1.0)).where(covered, 0.0)
+    return torch.cat([color, alpha.where(covered, 0.0)[None]])
+
+
+@contextlib.contextmanager
 def _exr_folder(path: Path, fps: float) -> Iterator[FrameSink]:
     path.mkdir()
     counter = _Counter()
@@ -250,7 +275,7 @@ def write_exr(path: Path, rendering: Rendering, camera: Camera, *, frame: int) -
     import kornia.color
 
     alpha = rendering.alphas.detach().cpu().clamp(0.0, 1.0)
-    covered = alpha > 1e-4
+    covered = alpha > _LEAST_ALPHA
     divisor = torch.where(covered, alpha, 1.0)
     display = (rendering.image.detach().cpu() / divisor).clamp(0.0, 1.0)
     linear = kornia.color.rgb_to_linear_rgb(display) * alpha

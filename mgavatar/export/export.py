@@ -11,6 +11,7 @@ import torch
 
 from mgavatar import __version__
 from mgavatar.avatar import Avatar
+from mgavatar.driving.expression_map import ExpressionMap
 from mgavatar.driving.motion import DEFAULT_FPS, Driving
 from mgavatar.driving.retarget import driving_notes, poses_of
 from mgavatar.errors import DataError
@@ -80,6 +81,7 @@ def export(
     to: Content | None = None,
     pose: str = "neutral",
     driving: Driving | None = None,
+    expression_map: ExpressionMap | None = None,
     degree: int = 3,
     morphs: int = MORPHS,
     up: Up = "y",
@@ -93,6 +95,7 @@ def export(
         to: ``"splats"``, ``"mesh"`` or ``"rig"``; by default splats in a ``.ply`` and the mesh in other files.
         pose: ``"neutral"``, ``"mean"`` or the number of a frame; see :func:`export_pose`.
         driving: Motion that the frame is of, or a rig's animation.
+        expression_map: Map from ARKit's blendshapes to the avatar's head; by default that of its names.
         degree: Degree of the splats' spherical harmonics, 0 to 3.
         morphs: Largest number of a rig's expressions.
         up: Axis of the file that points upwards; ``"-y"`` for splats in a ``.ply`` only.
@@ -108,13 +111,17 @@ def export(
     content = content_of(out, to, up=up, overwrite=overwrite)
     if morphs < 0:
         raise DataError(f"--morphs {morphs}: give a number of expressions, 0 or more")
-    chosen, posed_as = export_pose(avatar, pose, None if content == "rig" else driving)
+    of_frame = None if content == "rig" else driving
+    chosen, posed_as = export_pose(avatar, pose, of_frame, expression_map=expression_map)
     facts: dict[str, Any] = {"mgavatar": __version__, "pose": posed_as, "unit": "metre", "up": up}
-    notes = driving_notes(avatar, driving) if driving is not None else []
+    notes = driving_notes(avatar, driving, expression_map=expression_map) if driving is not None else []
     if avatar.appearance is None:
         notes.append("the avatar has no appearance stage: the colours are those of its vertex-bound Gaussians")
     if content == "rig":
-        return [*notes, _write_rig(out, avatar, chosen, driving, morphs, facts)]
+        motion = poses_of(avatar, driving, expression_map=expression_map) if driving is not None else []
+        rig = bake_rig(avatar, n_expr=morphs)
+        fps = driving.fps if driving is not None else DEFAULT_FPS
+        return [*notes, _write_rig(out, avatar, rig, chosen, motion, fps, facts)]
     if content == "mesh":
         _write_mesh(out, avatar, chosen, facts)
         return notes
@@ -125,7 +132,9 @@ def export(
     return [*notes, _cost_line(costs)]
 
 
-def export_pose(avatar: Avatar, pose: str, driving: Driving | None = None) -> tuple[Pose, str]:
+def export_pose(
+    avatar: Avatar, pose: str, driving: Driving | None = None, *, expression_map: ExpressionMap | None = None
+) -> tuple[Pose, str]:
     """Return a pose by its name, and a line that describes it.
 
     Args:
@@ -134,6 +143,7 @@ def export_pose(avatar: Avatar, pose: str, driving: Driving | None = None) -> tu
             on average in the capture, with a neutral face; or a frame, counted from 0: of ``driving`` if it is given,
             else of the capture.
         driving: Motion that the frame is of.
+        expression_map: As in :func:`export`.
 
     Raises:
         DataError: If there is no such pose.
@@ -151,7 +161,8 @@ def export_pose(avatar: Avatar, pose: str, driving: Driving | None = None) -> tu
     if frame >= n_frames:
         raise DataError(f"--pose {pose}: {whose} has {n_frames} frames, 0 to {n_frames - 1}")
     if driving is not None:
-        return poses_of(avatar, driving, frames=slice(frame, frame + 1))[0], f"frame {frame} of {driving.path.name}"
+        (driven,) = poses_of(avatar, driving, expression_map=expression_map, frames=slice(frame, frame + 1))
+        return driven, f"frame {frame} of {driving.path.name}"
     with torch.no_grad():
         return avatar.head.pose(frame), f"frame {frame} of the capture"
 
@@ -167,15 +178,12 @@ def _write_mesh(out: Path, avatar: Avatar, pose: Pose, facts: dict[str, Any]) ->
 
 
 def _write_rig(
-    out: Path, avatar: Avatar, pose: Pose, driving: Driving | None, morphs: int, facts: dict[str, Any]
+    out: Path, avatar: Avatar, rig: Rig, pose: Pose, motion: list[Pose], fps: float, facts: dict[str, Any]
 ) -> str:
     """Write a rig and return the line about its error."""
-    rig = bake_rig(avatar, n_expr=morphs)
-    motion = poses_of(avatar, driving) if driving is not None else []
     mean, largest = rig_error(avatar, rig, motion or training_poses(avatar))
-    rest = replace(bake_mesh(avatar, pose), verts=rig.verts.cpu().numpy(), normals=_normals(avatar, rig))
     facts |= {"mean_mm_from_the_avatar": round(mean, 3), "largest_mm_from_the_avatar": round(largest, 3)}
-    fps = driving.fps if driving is not None else DEFAULT_FPS
+    rest = replace(bake_mesh(avatar, pose), verts=rig.verts.cpu().numpy(), normals=_normals(avatar, rig))
     write_rig_glb(out, rest, rig, pose, motion=motion, fps=fps, extras=facts)
     whose = "of the motion" if motion else "of the capture"
     n = len(rig.expr_dirs)
