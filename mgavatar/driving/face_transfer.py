@@ -144,7 +144,7 @@ class _Face:
 
 
 def register_face(source: HeadModel, target: HeadModel) -> FaceTransfer:
-    """Bring the built-in face and another head into correspondence.
+    """Register the built-in face with that of another head.
 
     Args:
         source: The built-in head.
