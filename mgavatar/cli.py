@@ -171,6 +171,7 @@ def render(
     head_motion: Literal["full", "neck", "none"] = "full",
     expression: Literal["auto", "use", "ignore"] = "auto",
     expression_map: Path | None = None,
+    smooth: bool = False,
     format: Literal["auto", "png", "exr", "mp4"] = "auto",
     size: str | None = None,
     frames: str | None = None,
@@ -189,6 +190,7 @@ def render(
         head_motion: Take the root's motion as driven (full), put it into the neck (neck), or take none.
         expression: Use the expression columns if their basis is the head's (auto), always (use), or ignore them.
         expression_map: Map from ARKit's blendshapes to the avatar's head; by default by names, else computed.
+        smooth: Smooth jittery motion, without delay.
         format: Format of single frames, or mp4; by default as --out says.
         size: Image size, WIDTHxHEIGHT; the camera's own by default.
         frames: Frames to draw, START:STOP or START:STOP:STEP, counted from 0.
@@ -203,6 +205,7 @@ def render(
     from mgavatar.driving.read import read_driving
     from mgavatar.driving.render import backdrop
     from mgavatar.driving.render import render as run_render
+    from mgavatar.driving.smooth import smoothed
     from mgavatar.driving.writers import default_name, kind_of
     from mgavatar.progress import Reporter
 
@@ -215,6 +218,9 @@ def render(
         if not 0.0 < fps <= 1000.0:
             raise DataError(f"--fps {fps:g}: must lie between 0 and 1000")
         motion = dataclasses.replace(motion, fps=fps)
+    if smooth:
+        motion, jitter = smoothed(motion)
+        _say(jitter)
     loaded = Avatar.load(avatar, device=find_device(device))
     mapped, note = map_for(motion, loaded.head_model, given=expression_map, avatar=avatar)
     _say_all([note] if note else [])

@@ -144,7 +144,7 @@ def test_insta_without_its_tracker(root):
 def test_a_frame_that_failed(root):
     (root / "checkpoint/00002.frame").write_bytes(b"PK\x03\x04")
     message = refusal(root)
-    assert "00002.frame: not a readable .frame file of metrical-tracker" in message
+    assert "00002.frame: not a readable file of torch.save" in message
     assert "--skip-bad" in message
     assert read_capture(root, skip_bad=True).timestep_ids == (0, 1, 3, 4, 5)
 

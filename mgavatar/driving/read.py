@@ -6,9 +6,21 @@ from pathlib import Path
 from typing import Protocol
 
 from mgavatar.driving.motion import Driving
-from mgavatar.driving.readers import audio2face, flame_codes, lam, live_link, mediapipe, vhap
+from mgavatar.driving.readers import (
+    artalk,
+    audio2face,
+    cap4d,
+    flame_codes,
+    flame_head_tracker,
+    lam,
+    live_link,
+    mediapipe,
+    nersemble,
+    tracker_frames,
+    vhap,
+)
 from mgavatar.errors import DataError
-from mgavatar.files import existing_file, npz_names, one_line, read_npz
+from mgavatar.files import existing_file, foreign_content, npz_names, one_line, read_npz
 
 
 class Reader(Protocol):
@@ -26,7 +38,19 @@ class Reader(Protocol):
         ...
 
 
-READERS: tuple[Reader, ...] = (flame_codes, vhap, live_link, audio2face, lam, mediapipe)
+READERS: tuple[Reader, ...] = (
+    nersemble,
+    cap4d,
+    flame_head_tracker,
+    tracker_frames,
+    flame_codes,
+    vhap,
+    artalk,
+    live_link,
+    audio2face,
+    lam,
+    mediapipe,
+)
 """All formats, in the order in which they are tried: those whose marks are more particular come first."""
 
 
@@ -63,6 +87,8 @@ def _description(path: Path) -> str:
     if path.is_dir():
         return _folder_description(path)
     existing_file(path)
+    if (foreign := foreign_content(path)) is not None:
+        return foreign
     start = _first_bytes(path)
     for magic, name in _MAGIC.items():
         if start.startswith(magic):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -198,6 +198,7 @@ def poses_of(
         Poses on the CPU.
     """
     mean = avatar.mean_pose()
+    driving = _about_root(avatar, driving)
     face = expression_on(driving, avatar.head_model, mode=expression, expression_map=expression_map)
     rotation, neck = driving.rotation, driving.neck_pose
     if head_motion == "full":
@@ -229,13 +230,31 @@ def head_points(avatar: Avatar, rotation: np.ndarray, neck: np.ndarray, translat
     Returns:
         Points in world space [m], shape [T, 3].
     """
-    head = avatar.head
-    with torch.no_grad():
-        joints = head.joints(head.canonical()).cpu().numpy().astype(np.float64)
+    joints = _joints(avatar)
     root, top = joints[0], joints[1]
     inside = (top + joints[3] + joints[4]) / 3.0
     turned = top + Rotation.from_rotvec(neck).apply(inside - top)
     return root + Rotation.from_rotvec(rotation).apply(turned - root) + translation
+
+
+def _about_root(avatar: Avatar, driving: Driving) -> Driving:
+    """Return the same motion with its rotation about the root joint of the avatar's own head.
+
+    A rotation R about the origin followed by a translation t is one about the joint J by t + R J - J.
+    """
+    if driving.pivot == "root":
+        return driving
+    joint = _joints(avatar)[0]
+    moved = Rotation.from_rotvec(driving.rotation).apply(joint) - joint
+    translation = (driving.translation + moved).astype(np.float32)
+    return replace(driving, translation=translation, pivot="root")
+
+
+def _joints(avatar: Avatar) -> np.ndarray:
+    """Return the rest joints of the avatar's head [m], shape [5, 3], float64."""
+    head = avatar.head
+    with torch.no_grad():
+        return head.joints(head.canonical()).cpu().numpy().astype(np.float64)
 
 
 def _shift(avatar: Avatar, driving: Driving, mean: Pose) -> np.ndarray:

@@ -148,3 +148,14 @@ def json_numbers(values: list[Any], *, where: str) -> np.ndarray:
         return np.array(values, np.float64)
     except OverflowError as error:
         raise DataError(f"{where}: a number is too large") from error
+
+
+def json_times(values: list[Any], *, where: str) -> np.ndarray | None:
+    """Return time stamps as float64, or None if there are none or some of them are no numbers.
+
+    Raises:
+        DataError: If a number is too large.
+    """
+    if not values or not {*map(type, values)} <= {int, float}:
+        return None
+    return json_numbers(values, where=where)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from mgavatar.driving.motion import MAX_FRAMES
+from mgavatar.driving.motion import MAX_FRAMES, Driving, Pivot, motion_of
 from mgavatar.errors import DataError
 
 COMMON_RATES = (24.0, 25.0, 30.0, 48.0, 50.0, 60.0, 90.0, 120.0)
@@ -18,6 +18,9 @@ SNAP = 0.02
 
 REGULAR = 0.25
 """Largest distance of a time stamp from its regular time, in frames, at which frames are kept as they are."""
+
+LARGEST = 1e6
+"""Largest weight, coefficient or distance that is taken for one."""
 
 DEFAULT_ARKIT_FPS = 30.0
 
@@ -66,6 +69,8 @@ def at_regular_times(track: Track, *, fps: float | None, path: Path) -> Track:
     for rows in (track.values[found], *(rows[found] for rows in track.rotations.values())):
         if not np.isfinite(rows).all():
             raise DataError(f"{path}: frames hold NaN, infinity or empty cells; remove these frames")
+        if np.abs(rows).max(initial=0.0) > LARGEST:
+            raise DataError(f"{path}: frames hold numbers up to {np.abs(rows).max():.3g}, which are no motion")
     notes = [f"{path}: {n_frames - found.sum()} of {n_frames} frames have no face; they are filled from the others"]
     times, keep, rate, more = _clock(track.times, n_frames, fps=fps, path=path)
     notes = [*(notes if not found.all() else []), *more]
@@ -138,3 +143,44 @@ def _turned(at: np.ndarray, vectors: np.ndarray, goal: np.ndarray) -> np.ndarray
     if len(at) == 1:
         return np.repeat(vectors, len(goal), axis=0)
     return Slerp(at, Rotation.from_rotvec(vectors))(np.clip(goal, at[0], at[-1])).as_rotvec()
+
+
+def numbered_motion(
+    numbers: np.ndarray,
+    rows: dict[str, np.ndarray],
+    *,
+    path: Path,
+    fps: float,
+    pivot: Pivot,
+    notes: tuple[str, ...] = (),
+) -> Driving:
+    """Return the motion of numbered frames; frames that are missing among them are filled from their neighbours.
+
+    Args:
+        numbers: Numbers of the frames, ascending, shape [T].
+        rows: Parameters by their names in ``MOTION_KEYS``, shape [T, n] each; all of them may be absent but ``expr``.
+        path: The file or folder.
+        fps: Frames per second.
+        pivot: As in ``Driving``.
+        notes: As in ``Driving``.
+
+    Raises:
+        DataError: If numbers lie so far apart that they do not count frames.
+    """
+    turns = {
+        f"{key} {joint}": rows[key][:, 3 * joint : 3 * joint + 3]
+        for key in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")
+        if key in rows
+        for joint in range(rows[key].shape[1] // 3)
+    }
+    n_expr = rows["expr"].shape[1]
+    values = np.concatenate([rows["expr"], rows.get("translation", np.zeros((len(numbers), 3)))], axis=1)
+    track = at_regular_times(Track(numbers / fps, values, turns), fps=fps, path=path)
+    filled = {"expr": track.values[:, :n_expr], "translation": track.values[:, n_expr:]}
+    for name, vectors in track.rotations.items():
+        filled.setdefault(name.split()[0], np.zeros((len(vectors), 0)))
+        filled[name.split()[0]] = np.concatenate([filled[name.split()[0]], vectors], axis=1)
+    missing = len(track.values) - len(numbers)
+    more = (f"{path}: {missing} frames are missing; they are filled from their neighbours",) if missing else ()
+    plain = {key: np.ascontiguousarray(value, np.float32) for key, value in filled.items()}
+    return motion_of(plain, path=path, fps=fps, pivot=pivot, notes=(*notes, *more))

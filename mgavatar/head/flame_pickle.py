@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import zipfile
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
@@ -17,7 +18,7 @@ from typing import Any, ClassVar, NoReturn
 import numpy as np
 
 from mgavatar.errors import DataError
-from mgavatar.files import GIBIBYTE, foreign_content, one_line, read_bytes
+from mgavatar.files import GIBIBYTE, existing_file, foreign_content, one_line, read_bytes
 
 MAX_DEPTH = 6
 """Largest depth of arrays in arrays (chumpy objects in chumpy objects); FLAME's files need 3."""
@@ -25,6 +26,8 @@ MAX_DENSE = 50_000_000
 """Largest number of elements of a sparse matrix after it has been made dense."""
 ARCHIVES = {b"PK\x03\x04": "zip", b"\x1f\x8b": "gzip", b"7z\xbc\xaf": "7z", b"Rar!": "rar"}
 """Archives that FLAME's files are handed on in, by their first bytes."""
+MAX_PICKLE_BYTES = 64 << 20
+"""Largest pickle of one frame."""
 PLAIN_TYPES = ("b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 
 
@@ -215,6 +218,38 @@ def read_pickled_arrays(data: bytes, *, path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{path}: holds a {one_line(type(content).__name__)}, a dictionary is needed")
     return _tree(content, path=path, depth=0)
+
+
+def read_torch_archive(path: Path) -> dict[str, Any]:
+    """Read a dictionary of numpy arrays that ``torch.save`` wrote, without torch and without running its pickle.
+
+    ``torch.load(weights_only=True)`` with numpy's names allowed would do as well with honest files, but it also builds
+    arrays of a forged type, which break the interpreter when they are freed.
+
+    Args:
+        path: The file, a zip archive: a ``.frame`` of metrical-tracker or Pixel3DMM.
+
+    Returns:
+        As :func:`read_pickled_arrays`.
+
+    Raises:
+        DataError: If the file is no such archive, is damaged, or holds anything but numpy's arrays, such as tensors.
+    """
+    existing_file(path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = [info for info in archive.infolist() if info.filename.rpartition("/")[2] == "data.pkl"]
+            if len(members) != 1 or members[0].compress_type != zipfile.ZIP_STORED:
+                raise DataError(f"{path}: not a file of torch.save: no data.pkl as it writes it")
+            if members[0].file_size > MAX_PICKLE_BYTES:
+                raise DataError(f"{path}: its data.pkl has more than {MAX_PICKLE_BYTES >> 20} MiB")
+            data = archive.read(members[0])
+    except DataError:
+        raise
+    except Exception as error:  # whatever a damaged archive makes zipfile raise
+        reason = foreign_content(path) or one_line(error) or type(error).__name__
+        raise DataError(f"{path}: not a readable file of torch.save ({reason})") from error
+    return read_pickled_arrays(data, path=path)
 
 
 def _tree(content: dict[Any, Any], *, path: Path, depth: int) -> dict[str, Any]:

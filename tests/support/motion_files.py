@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True)
@@ -241,4 +243,129 @@ def write_mediapipe(
             if matrices:
                 frames[-1]["facial_transformation_matrixes"] = [matrix.tolist()] if faces else []
     path.write_text("\n".join(map(json.dumps, frames)) + "\n" if style == "lines" else json.dumps(frames))
+    return path
+
+
+def matrix_of(vector: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula, written out."""
+    angle = np.linalg.norm(vector)
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+
+
+def two_rows(vector: np.ndarray) -> np.ndarray:
+    """A rotation in six numbers, as pytorch3d writes it: the first two rows of its matrix."""
+    return matrix_of(vector)[:2].ravel()
+
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""From camera axes of OpenGL to those of OpenCV, and back."""
+
+
+def write_cap4d(path: Path, made: Performance, *, camera: bool = True) -> Path:
+    """CAP4D's fit: FLAME in its own axes about the origin, exchanged into OpenCV's, seen by a camera somewhere."""
+    n = len(made.expr)
+    extrinsics = np.eye(4)
+    if camera:
+        extrinsics[:3, :3], extrinsics[:3, 3] = matrix_of(np.array([0.1, 2.9, -0.3])), (0.2, 0.1, 0.9)
+    turn, place = FLIP @ extrinsics[:3, :3].T @ FLIP, -FLIP @ extrinsics[:3, :3].T @ extrinsics[:3, 3]
+    world = [turn @ matrix_of(vector) for vector in made.root]
+    rot = np.stack([Rotation.from_matrix(matrix).as_rotvec() for matrix in world])
+    expr = made.expr[:, :65].copy()
+    expr[:, 64] = 0.8
+    arrays = {"expr": expr, "rot": rot, "tra": made.place @ turn.T + place, "eye_rot": made.left_eye}
+    arrays = {key: value.astype(np.float32) for key, value in arrays.items()}
+    lens = {key: np.full((1, 1), 2.0) for key in ("fx", "fy", "cx", "cy")}
+    if camera:
+        arrays["extr"] = extrinsics[None].astype(np.float32)
+    np.savez(path, shape=np.zeros(150), **arrays, neck_rot=np.zeros((n, 3)), **lens, fps=30.0)
+    return path
+
+
+def write_nersemble(path: Path, made: Performance, *, scale: float = 1.7) -> Path:
+    """The benchmark's tracking: Euler angles beside matrices, a scale for the whole head."""
+    matrices = np.stack([matrix_of(vector) for vector in made.root])
+    np.savez(
+        path,
+        shape=np.zeros((1, 300)),
+        expression=made.expr,
+        rotation=Rotation.from_matrix(matrices).as_euler("xyz"),
+        rotation_matrices=matrices,
+        translation=scale * made.place,
+        jaw=made.jaw,
+        neck=made.neck,
+        eyes=made.eyes,
+        frames=np.arange(len(made.expr)),
+        scale=np.full((1, 1), scale),
+    )
+    return path
+
+
+def write_metrical(folder: Path, made: Performance, *, without: tuple[int, ...] = ()) -> Path:
+    """metrical-tracker's frames: the head stands still, and OpenCV's camera moves; numbers have five digits."""
+    (folder / "checkpoint").mkdir(parents=True)
+    for t in set(range(len(made.expr))) - set(without):
+        flame = {
+            "exp": made.expr[t][None].astype(np.float32),
+            "shape": np.zeros((1, 300), np.float32),
+            "eyes": np.concatenate([two_rows(made.left_eye[t]), two_rows(made.right_eye[t])])[None],
+            "jaw": two_rows(made.jaw[t])[None],
+            "eyelids": np.full((1, 2), 0.3, np.float32),
+        }
+        opencv = {"R": (FLIP @ matrix_of(made.root[t]))[None], "t": (FLIP @ made.place[t])[None], "K": np.eye(3)[None]}
+        content = {"flame": flame, "opencv": opencv, "img_size": np.array([512, 512]), "frame_id": f"{t:05d}"}
+        torch.save(content, folder / f"checkpoint/{t:05d}.frame")
+    return folder
+
+
+def write_pixel3dmm(folder: Path, made: Performance) -> Path:
+    """Pixel3DMM's frames: joints in six numbers, then R and t about the origin, then a still camera of OpenGL."""
+    folder.mkdir(parents=True)
+    base, shift = matrix_of(np.array([0.05, 0.3, -0.1])), np.array([0.1, -0.2, -1.5])
+    for t in range(len(made.expr)):
+        turn = base.T @ matrix_of(made.root[t])
+        flame = {
+            "exp": made.expr[t][None].astype(np.float32),
+            "eyes": np.concatenate([two_rows(made.left_eye[t]), two_rows(made.right_eye[t])])[None],
+            "jaw": two_rows(made.jaw[t])[None],
+            "neck": two_rows(made.neck[t])[None],
+            "eyelids": np.zeros((1, 2), np.float32),
+            "R": turn[:2].reshape(1, 6),
+            "R_rotation_matrix": turn[None],
+            "t": (base.T @ (made.place[t] - shift))[None],
+        }
+        camera = {"R_base_0": base[None], "t_base_0": shift[None], "fl": np.ones((1, 1)), "pp": np.zeros((1, 2))}
+        torch.save({"flame": flame, "camera": camera, "img_size": np.array([256, 256])}, folder / f"{t:05d}.frame")
+    return folder
+
+
+def write_flame_head_tracker(folder: Path, made: Performance, *, without: tuple[int, ...] = ()) -> Path:
+    """flame-head-tracker's frames: camera to world in Euler angles, pictures, and nothing where no face was found."""
+    folder.mkdir()
+    for t in set(range(len(made.expr))) - set(without):
+        camera = matrix_of(made.root[t]).T
+        # R = Rz(c2) Ry(c0) Rx(c1), solved from the elements of the matrix
+        c0, c1, c2 = -np.arcsin(camera[2, 0]), np.arctan2(*camera[2, [1, 2]]), np.arctan2(camera[1, 0], camera[0, 0])
+        cam = np.array([c0, c1, c2, *(-camera @ made.place[t])])
+        np.savez(
+            folder / f"{t}.npz",
+            shape=np.zeros((1, 300), np.float32),
+            exp=made.expr[t][None],
+            jaw_pose=made.jaw[t][None],
+            eye_pose=made.eyes[t][None],
+            cam=cam[None],
+            fov=np.array([20.0]),
+            K=np.eye(3)[None],
+            img=np.zeros((1, 64, 64, 3), np.uint8),
+            blendshape_scores=np.zeros((1, 52)),
+        )
+    return folder
+
+
+def write_artalk(path: Path, made: Performance) -> Path:
+    """ARTalk's motion: one tensor."""
+    torch.save(torch.tensor(np.hstack([made.expr, made.root, made.jaw]), dtype=torch.float32), path)
     return path

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +23,11 @@ from mgavatar.capture.subject import SPLITS, Frame, Split, Subject
 from mgavatar.capture.transforms import FrameReader, LinkedFolders
 from mgavatar.config import PrincipalPoint
 from mgavatar.errors import DataError
-from mgavatar.files import existing_file, float_array, foreign_content, one_line, path_inside, read_json
-from mgavatar.head.flame_pickle import read_pickled_arrays
+from mgavatar.files import float_array, one_line, path_inside, read_json
+from mgavatar.head.flame_pickle import read_torch_archive
 from mgavatar.head.params import HeadParams
 
 MARK = "checkpoint/*.frame"
-
-MAX_PICKLE_BYTES = 64 << 20
 
 TEST_FRAMES = 350
 """Last frames that the field holds out; of shorter videos, the last 30 %."""
@@ -174,7 +171,7 @@ def _tracked(root: Path, wanted: set[int], failures: Failures) -> dict[int, _Tra
 
 
 def _read_frame(path: Path) -> _Tracked:
-    content = _unpickled(path)
+    content = read_torch_archive(path)
     flame, opencv = (_table(content, key, path) for key in ("flame", "opencv"))
     R = _floats(opencv, "R", 9, path).reshape(3, 3)
     K = _floats(opencv, "K", 9, path).reshape(3, 3)
@@ -216,25 +213,6 @@ def rotation_vector(six: np.ndarray, *, path: Path) -> np.ndarray:
         raise DataError(f"{path}: a rotation of six numbers has rows that are parallel or zero")
     y = across / length
     return Rotation.from_matrix(np.stack([x, y, np.cross(x, y)])).as_rotvec()
-
-
-def _unpickled(path: Path) -> dict[str, Any]:
-    """Return the contents of a file of ``torch.save``, a zip archive, without torch and without running its pickle."""
-    existing_file(path)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = [info for info in archive.infolist() if info.filename.rpartition("/")[2] == "data.pkl"]
-            if len(members) != 1 or members[0].compress_type != zipfile.ZIP_STORED:
-                raise DataError(f"{path}: not a .frame of metrical-tracker: no data.pkl as torch.save writes it")
-            if members[0].file_size > MAX_PICKLE_BYTES:
-                raise DataError(f"{path}: its data.pkl has more than {MAX_PICKLE_BYTES >> 20} MiB")
-            data = archive.read(members[0])
-    except DataError:
-        raise
-    except Exception as error:  # whatever a damaged archive makes zipfile raise
-        reason = foreign_content(path) or one_line(error) or type(error).__name__
-        raise DataError(f"{path}: not a readable .frame file of metrical-tracker ({reason})") from error
-    return read_pickled_arrays(data, path=path)
 
 
 def _table(content: dict[str, Any], key: str, path: Path) -> dict[str, Any]:

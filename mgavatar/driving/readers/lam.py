@@ -9,7 +9,7 @@ import numpy as np
 
 from mgavatar.driving.arkit import FEWEST_NAMES, Weights, arkit_motion, n_arkit_names
 from mgavatar.driving.motion import Driving, frame_rate
-from mgavatar.driving.tables import json_content, json_numbers
+from mgavatar.driving.tables import json_content, json_numbers, json_times
 from mgavatar.errors import DataError
 
 UNDERSTOOD = "LAM's JSON"
@@ -35,13 +35,11 @@ def read(path: Path) -> Driving:
         rows.append(json_numbers(weights, where=f"{path}: frame {index}: weights"))
     metadata = content.get("metadata")
     rate = metadata.get("fps") if isinstance(metadata, dict) else None
-    times = [frame.get("time") for frame in content["frames"]]
-    known = bool(times) and all(isinstance(time, int | float) for time in times)
     turned = any(frame.get("rotation") for frame in content["frames"])
     weights = Weights(
         names,
         np.array(rows, np.float64).reshape(len(rows), len(names)),
-        times=np.array(times, np.float64) if known else None,
+        times=json_times([frame.get("time") for frame in content["frames"]], where=f"{path}: time"),
         fps=None if rate is None else frame_rate(json_numbers([rate], where=f"{path}: fps"), path=path),
         notes=(f"{path}: not used: rotation",) if turned else (),
     )

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from mgavatar.driving.arkit import FEWEST_NAMES, Weights, arkit_motion, arkit_name, n_arkit_names
 from mgavatar.driving.motion import Driving, frame_rate
-from mgavatar.driving.tables import MAX_TABLE_BYTES, json_content, json_numbers, opening
+from mgavatar.driving.tables import MAX_TABLE_BYTES, json_content, json_numbers, json_times, opening
 from mgavatar.errors import DataError
 from mgavatar.files import one_line, read_bytes
 
@@ -65,7 +65,7 @@ def read(path: Path) -> Driving:
     weights = Weights(
         names,
         values,
-        times=_times(frames),
+        times=_times(frames, path=path),
         fps=None if rate is None else frame_rate(json_numbers([rate], where=f"{path}: fps"), path=path),
         head=_head(frames, ~np.isnan(values).all(axis=1), path=path),
     )
@@ -128,15 +128,12 @@ def _categories(value: list[Any]) -> dict[str, Any]:
     }
 
 
-def _times(frames: list[Any]) -> np.ndarray | None:
+def _times(frames: list[Any], *, path: Path) -> np.ndarray | None:
     """Return the time of each frame [s], or None if not all frames have one."""
     for key, unit in TIMES.items():
         given = [frame.get(key) if isinstance(frame, dict) else None for frame in frames]
-        if given and all(isinstance(time, int | float) and not isinstance(time, bool) for time in given):
-            try:
-                times = np.array(given, np.float64)
-            except OverflowError:
-                return None
+        times = json_times(given, where=f"{path}: {key}")
+        if times is not None:
             return times * (unit or _unit(times))
     return None
 
