@@ -355,7 +355,7 @@ def _raw_writes(tree: ast.AST) -> Iterator[int]:
         name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
         owner = ast.unparse(function.value) if isinstance(function, ast.Attribute) else ""
         into = [ast.unparse(argument) for argument in call.args]
-        to_file = any(argument in ("file", "buffer") for argument in into)
+        to_file = any(argument in ("file", "buffer", "text") for argument in into)
         modes = [*call.args, *(keyword.value for keyword in call.keywords if keyword.arg == "mode")]
         opens = name == "open" and any(
             isinstance(mode, ast.Constant) and isinstance(mode.value, str) and set(mode.value) & set("wax+")
