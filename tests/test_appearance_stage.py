@@ -162,6 +162,22 @@ def test_the_layers_of_offset_net():
     assert net.latent.std().item() == pytest.approx(0.1, rel=0.1)
 
 
+def test_the_last_layer_of_offset_net_sees_the_maps_at_full_resolution():
+    """A change of one texel arrives beside the decoder, only where it is: the embedding reaches one texel further."""
+    torch.manual_seed(5)
+    net = OffsetNet(tiny_config().appearance.offset_net)
+    torch.nn.init.normal_(net.last.weight)
+    maps = torch.rand(3, 32, 32)
+    changed = maps.clone()
+    changed[:, 9, 20] += 1.0
+    with torch.no_grad():
+        net.last.weight[:, : tiny_config().appearance.offset_net.channels // 2] = 0.0  # what the decoder adds
+        differs = (net(changed, maps, torch.zeros(N_THETA)) != net(maps, maps, torch.zeros(N_THETA))).any(0)
+    rows, columns = torch.nonzero(differs).unbind(1)
+    assert (rows.min(), rows.max()) == (7, 11)
+    assert (columns.min(), columns.max()) == (18, 22)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 4), (16, 16)])
 def test_upsampling_is_that_of_torch(size):
     """The values of ``nn.Upsample`` to the bit, and its adjoint in double precision."""
